@@ -1,0 +1,1 @@
+"""pigjax: differentiable physics in 3D Gaussian splat scenes."""

@@ -1,0 +1,164 @@
+"""Pinhole cameras in OpenCV axes: projection, unprojection, orbits and interpolated paths."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from pigjax.arrays import array_field, static_field
+
+
+class Camera(eqx.Module):
+    """A pinhole camera, x right, y down, z forward, pixel centres at +0.5.
+
+    A leading axis on the arrays makes a batch of cameras of one size; `vmap` over it or index it.
+    """
+
+    world_to_cam: Float[Array, "*batch 4 4"] = array_field()  # rigid transform [m]
+    focal: Float[Array, "*batch 2"] = array_field()  # [px]
+    centre: Float[Array, "*batch 2"] = array_field()  # principal point [px]
+    width: int = static_field()  # [px]
+    height: int = static_field()  # [px]
+
+    @property
+    def position(self) -> Float[Array, "*batch 3"]:
+        """Camera centre in the world [m].
+
+        Solved from the whole matrix: -Rᵀt is right only on the rigid manifold, so its pose gradients are wrong off it.
+        """
+        return jnp.linalg.inv(self.world_to_cam)[..., :3, 3]
+
+    def __getitem__(self, index) -> Camera:
+        """One camera, or a slice, of a batch."""
+        return Camera(self.world_to_cam[index], self.focal[index], self.centre[index], self.width, self.height)
+
+    def __len__(self) -> int:
+        """Number of cameras of a batch.
+
+        Raises:
+            TypeError: the camera is a single one.
+        """
+        if self.world_to_cam.ndim != 3:
+            raise TypeError("Camera is a single camera, not a batch: its world_to_cam has no leading axis.")
+        return self.world_to_cam.shape[0]
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view at another resolution [px]."""
+        factor = jnp.asarray([width / self.width, height / self.height], self.focal.dtype)
+        return Camera(self.world_to_cam, self.focal * factor, self.centre * factor, width, height)
+
+
+def look_at(
+    eye: Float[Array, "3"],
+    target: Float[Array, "3"],
+    *,
+    up: Float[Array, "3"] | tuple[float, float, float] = (0.0, 0.0, 1.0),
+    focal: float,
+    width: int,
+    height: int,
+) -> Camera:
+    """Camera at `eye` [m] that looks at `target` [m] with `up` on top and the principal point in the middle."""
+    eye, target, up = (jnp.asarray(v, jnp.result_type(float)) for v in (eye, target, up))
+    forward = (target - eye) / jnp.linalg.norm(target - eye)
+    right = jnp.cross(forward, up)
+    right = right / jnp.linalg.norm(right)
+    rotation = jnp.stack([right, jnp.cross(forward, right), forward])
+    world_to_cam = jnp.eye(4, dtype=eye.dtype).at[:3, :3].set(rotation).at[:3, 3].set(-rotation @ eye)
+    size = jnp.asarray([width, height], eye.dtype)
+    return Camera(world_to_cam, jnp.full(2, focal, eye.dtype), size / 2, width, height)
+
+
+def to_camera(points: Float[Array, "*n 3"], camera: Camera) -> Float[Array, "*n 3"]:
+    """World points in the frame of one camera [m]."""
+    return points @ camera.world_to_cam[:3, :3].T + camera.world_to_cam[:3, 3]
+
+
+def project(points: Float[Array, "*n 3"], camera: Camera) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"]]:
+    """Pixel coordinates [px] and camera depth z [m] of world points; points with z <= 0 are behind the camera."""
+    local = to_camera(points, camera)
+    depth = local[..., 2]
+    safe = jnp.where(depth > 0, depth, 1.0)
+    return local[..., :2] / safe[..., None] * camera.focal + camera.centre, depth
+
+
+def unproject(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "h w 3"]:
+    """World points of the pixel centres at camera depth z [m]."""
+    x = (jnp.arange(camera.width) + 0.5 - camera.centre[0]) / camera.focal[0]
+    y = (jnp.arange(camera.height) + 0.5 - camera.centre[1]) / camera.focal[1]
+    x, y = jnp.broadcast_arrays(x[None, :], y[:, None])
+    local = jnp.stack([x, y, jnp.ones_like(x)], -1) * depth[..., None]
+    rotation, translation = camera.world_to_cam[:3, :3], camera.world_to_cam[:3, 3]
+    return (local - translation) @ jnp.linalg.inv(rotation).T
+
+
+def orbit(
+    target: Float[Array, "3"] | tuple[float, float, float],
+    *,
+    radius: float,
+    elevation: float,
+    frames: int,
+    focal: float,
+    width: int,
+    height: int,
+    start: float = 0.0,
+    sweep: float = 2 * jnp.pi,
+    up: int = 2,
+) -> Camera:
+    """Batch of cameras on a circle around `target`.
+
+    Args:
+        target: centre that every camera looks at [m].
+        radius: distance to the target [m].
+        elevation: angle above the horizontal plane [rad].
+        frames: number of cameras.
+        focal: focal length [px].
+        width: image width [px].
+        height: image height [px].
+        start: first azimuth [rad].
+        sweep: angle covered; the last camera stops one step before it so that a full circle loops [rad].
+        up: index of the world axis that points up.
+    """
+    azimuth = start + sweep * jnp.arange(frames) / frames
+    axes = [jnp.cos(azimuth) * jnp.cos(elevation), jnp.sin(azimuth) * jnp.cos(elevation)]
+    offset = jnp.stack([*axes, jnp.full(frames, jnp.sin(elevation))], -1)
+    offset = jnp.roll(offset, up - 2, axis=-1) * radius
+    up_axis = jnp.eye(3)[up]
+    cameras = [
+        look_at(jnp.asarray(target) + o, jnp.asarray(target), up=up_axis, focal=focal, width=width, height=height)
+        for o in offset
+    ]
+    return stack_cameras(cameras)
+
+
+def stack_cameras(cameras: list[Camera]) -> Camera:
+    """Batch of single cameras of one size."""
+    return Camera(
+        jnp.stack([c.world_to_cam for c in cameras]),
+        jnp.stack([c.focal for c in cameras]),
+        jnp.stack([c.centre for c in cameras]),
+        cameras[0].width,
+        cameras[0].height,
+    )
+
+
+def interpolate_path(keys: Camera, frames: int) -> Camera:
+    """Batch of `frames` cameras that passes through the key cameras, positions linear and axes re-orthogonalised."""
+    count = len(keys)
+    t = jnp.linspace(0.0, count - 1.0, frames)
+    low = jnp.clip(jnp.floor(t).astype(int), 0, max(count - 2, 0))
+    high = jnp.minimum(low + 1, count - 1)
+    blend = t - low
+
+    def mix(values):
+        weight = blend.reshape(-1, *([1] * (values.ndim - 1)))
+        return values[low] * (1 - weight) + values[high] * weight
+
+    rotation = mix(keys.world_to_cam[:, :3, :3])
+    position = mix(keys.position)
+    u, _, vt = jnp.linalg.svd(rotation)
+    rotation = u @ vt
+    world_to_cam = jnp.zeros((frames, 4, 4), rotation.dtype).at[:, 3, 3].set(1.0)
+    world_to_cam = world_to_cam.at[:, :3, :3].set(rotation)
+    world_to_cam = world_to_cam.at[:, :3, 3].set(-jnp.einsum("fij,fj->fi", rotation, position))
+    return Camera(world_to_cam, mix(keys.focal), mix(keys.centre), keys.width, keys.height)
