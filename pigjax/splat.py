@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from pigjax.arrays import array_field, static_field
+from pigjax.camera import Camera, stack_cameras, to_camera
+from pigjax.errors import InputError
+from pigjax.linalg import quat_to_matrix, safe_normalize, safe_sqrt
+from pigjax.tiles import BlendConfig, Projected, blend, tile_boxes, tile_lists
 
 
 class Gaussians(eqx.Module):
@@ -30,7 +37,240 @@ class Splats(eqx.Module):
     factors: Float[Array, "n 3 3"] = array_field()  # [m]
     opacities: Float[Array, "n"] = array_field()  # in [0, 1]
     sh: Float[Array, "n k 3"] = array_field()
-    sh_rotations: Float[Array, "n 3 3"] | None = array_field(default=None)  # turns view-dependent colour with the matter
+    sh_rotations: Float[Array, "n 3 3"] | None = array_field(
+        default=None
+    )  # turns view-dependent colour with the matter
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+
+class Frame(eqx.Module):
+    """One drawn image; outputs that were not asked for are None."""
+
+    rgb: Float[Array, "*b h w 3"] | None = None
+    alpha: Float[Array, "*b h w"] | None = None
+    depth: Float[Array, "*b h w"] | None = None  # mean camera z of what is seen [m], 0 where nothing is
+    surface_depth: Float[Array, "*b h w"] | None = None  # camera z [m], NaN where transmittance stays above tau_T
+    object_weights: Float[Array, "*b h w m"] | None = None  # share of each object in the pixel
+    overflow: Int[Array, "*b"] | None = None  # box/tile pairs dropped for want of capacity
+
+
+class RenderConfig(eqx.Module):
+    """Every approximation of the renderer, static."""
+
+    tile_size: int = static_field(default=16)  # [px]
+    capacity: int | None = static_field(
+        default=None
+    )  # box/tile pairs that fit; None: 16 per splat, at least 4 per tile
+    sh_degree: int | None = static_field(default=None)  # None: all bands that the splats have
+    alpha_min: float = static_field(default=1 / 255)  # fainter contributions are skipped
+    alpha_max: float = static_field(default=0.99)
+    transmittance_min: float = static_field(default=1e-4)  # a pixel is closed before it falls below
+    dilation: float = static_field(default=0.3)  # added to the 2D covariance [px²]
+    antialias: bool = static_field(default=False)  # lower the opacity by what the dilation added
+    near: float = static_field(default=0.01)  # [m]
+    chunk: int = static_field(default=32)  # splats blended between two looks at whether the tile is opaque
+    differentiation: str = static_field(default="reverse")  # "forward" for jvp and hessians
+
+
+OUTPUTS = ("rgb", "alpha", "depth", "surface_depth", "object_weights")
+_SH_CONSTANT = 0.28209479177387814
+_FOV_MARGIN = 0.3  # the projection's linearisation is held at this share of half the image beyond its edge
+
+
+def gaussian_factors(gaussians: Gaussians) -> Float[Array, "n 3 3"]:
+    """Factors M = R S of the covariances M Mᵀ [m]."""
+    return quat_to_matrix(gaussians.quats) * jnp.exp(gaussians.log_scales)[:, None, :]
+
+
+def as_splats(gaussians: Gaussians | Splats) -> Splats:
+    """Gaussians as they stand, undeformed."""
+    if isinstance(gaussians, Splats):
+        return gaussians
+    opacities = jax.nn.sigmoid(gaussians.logit_opacities)
+    return Splats(gaussians.means, gaussian_factors(gaussians), opacities, gaussians.sh)
+
+
+def render(
+    gaussians_or_splats: Gaussians | Splats,
+    camera: Camera,
+    config: RenderConfig = RenderConfig(),  # noqa: B008  (frozen)
+    *,
+    background: Float[Array, "*c"] | float = 0.0,
+    outputs: Sequence[str] = ("rgb", "alpha"),
+    object_weights: Float[Array, "n m"] | None = None,
+    tau_T: Float[Array, ""] | float = 0.5,
+) -> Frame:
+    """Draw splats through one camera (Kerbl et al. 2023); `vmap` over cameras for a batch.
+
+    Args:
+        gaussians_or_splats: what is drawn.
+        camera: a single camera.
+        config: thresholds and capacities.
+        background: colour behind the splats, one number, three, or an image.
+        outputs: any of "rgb", "alpha", "depth", "surface_depth", "object_weights"; only these are traced.
+        object_weights: membership of each splat in each object, needed for the output of that name.
+        tau_T: transmittance that marks the surface (paper 3.2); not differentiated through.
+
+    Raises:
+        InputError: unknown output, or object weights asked for but not given.
+    """
+    unknown = [name for name in outputs if name not in OUTPUTS]
+    if unknown or not outputs:
+        raise InputError(f"outputs = {tuple(outputs)}: choose from {', '.join(OUTPUTS)}.")
+    if "object_weights" in outputs and object_weights is None:
+        raise InputError("outputs has 'object_weights': pass object_weights, the membership [n m] of each splat.")
+    splats = as_splats(gaussians_or_splats)
+    features = []
+    if "rgb" in outputs:
+        features.append(colours(splats, camera, config.sh_degree))
+    blending = blend_config(camera, config, surface="surface_depth" in outputs)
+    projected = project_splats(splats, camera, config)
+    if "depth" in outputs:
+        features.append(projected.depths[:, None])
+    if "object_weights" in outputs:
+        features.append(object_weights)
+    dtype = projected.depths.dtype
+    table = jnp.concatenate(features, 1) if features else jnp.zeros((len(splats), 0), dtype)
+    lists = tile_lists(lax.stop_gradient(projected), blending, capacity_of(config, len(splats), blending))
+    reverse = config.differentiation == "reverse"
+    transmittance, image, surface = blend(projected, table, lists, blending, tau_T, reverse=reverse)
+
+    frame = {"overflow": lists.overflow, "alpha": 1 - transmittance if "alpha" in outputs else None}
+    if "rgb" in outputs:
+        frame["rgb"] = image[..., :3] + transmittance[..., None] * background
+        image = image[..., 3:]
+    if "depth" in outputs:
+        alpha = 1 - transmittance
+        frame["depth"] = jnp.where(alpha > 0, image[..., 0] / jnp.where(alpha > 0, alpha, 1.0), 0.0)
+        image = image[..., 1:]
+    if "object_weights" in outputs:
+        frame["object_weights"] = image
+    if surface is not None:
+        frame["surface_depth"] = jnp.where(surface > 0, surface, jnp.nan)
+    return Frame(**frame)
+
+
+def surface_depth(
+    gaussians: Gaussians | Splats,
+    camera: Camera,
+    config: RenderConfig = RenderConfig(),  # noqa: B008
+    *,
+    tau_T: Float[Array, ""] | float = 0.5,
+) -> Float[Array, "h w"]:
+    """Camera z [m] of the Gaussian whose blend takes the transmittance below tau_T (paper 3.2); NaN where none does."""
+    return render(gaussians, camera, config, outputs=("surface_depth",), tau_T=tau_T).surface_depth
+
+
+def required_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: RenderConfig = RenderConfig()) -> int:  # noqa: B008
+    """Box/tile pairs that the fullest of these cameras needs, host. A capacity at least this large never overflows."""
+    splats = as_splats(gaussians)
+    batch = cameras if cameras.world_to_cam.ndim == 3 else stack_cameras([cameras])
+    return int(_most_pairs(splats, batch, config))
+
+
+@eqx.filter_jit
+def _most_pairs(splats: Splats, cameras: Camera, config: RenderConfig) -> Int[Array, ""]:
+    def pairs(camera: Camera) -> Int[Array, ""]:
+        _, box = tile_boxes(project_splats(splats, camera, config), blend_config(camera, config, surface=False))
+        return jnp.sum(box[:, 0] * box[:, 1])
+
+    return jnp.max(lax.map(pairs, cameras))
+
+
+def capacity_of(config: RenderConfig, count: int, blending: BlendConfig) -> int:
+    """Slots of the tile lists, a static number."""
+    return config.capacity if config.capacity is not None else max(16 * count, 4 * blending.tiles)
+
+
+def blend_config(camera: Camera, config: RenderConfig, *, surface: bool) -> BlendConfig:
+    """What the blending loop needs of the camera and the settings."""
+    return BlendConfig(
+        camera.width,
+        camera.height,
+        config.tile_size,
+        config.chunk,
+        config.alpha_min,
+        config.alpha_max,
+        config.transmittance_min,
+        surface,
+    )
+
+
+def colours(splats: Splats, camera: Camera, sh_degree: int | None = None) -> Float[Array, "n 3"]:
+    """Colour of each splat as the camera sees it, at least 0; colour turns with the splat's `sh_rotations`."""
+    degree = sh_degree_of(splats) if sh_degree is None else min(sh_degree, sh_degree_of(splats))
+    if degree == 0:
+        return jnp.maximum(_SH_CONSTANT * splats.sh[:, 0] + 0.5, 0.0)
+    directions = safe_normalize(splats.means - camera.position)
+    if splats.sh_rotations is not None:
+        directions = jnp.einsum("nij,ni->nj", splats.sh_rotations, directions)
+    basis = sh_basis(directions, degree)
+    return jnp.maximum(jnp.einsum("nk,nkc->nc", basis, splats.sh[:, : basis.shape[1]]) + 0.5, 0.0)
+
+
+def sh_degree_of(gaussians: Gaussians | Splats) -> int:
+    """Highest band of spherical harmonics that is stored.
+
+    Raises:
+        InputError: the number of coefficients is not 1, 4, 9 or 16.
+    """
+    bands = {1: 0, 4: 1, 9: 2, 16: 3}
+    count = gaussians.sh.shape[1]
+    if count not in bands:
+        raise InputError(f"sh has {count} coefficients per channel: 1, 4, 9 or 16 are needed (degree 0 to 3).")
+    return bands[count]
+
+
+def sh_basis(directions: Float[Array, "n 3"], degree: int) -> Float[Array, "n k"]:
+    """Real spherical harmonics up to a degree at unit directions, in the order and signs of 3DGS."""
+    x, y, z = directions.T
+    basis = [jnp.full_like(x, _SH_CONSTANT)]
+    if degree > 0:
+        basis += [0.4886025119029199 * v for v in (-y, z, -x)]
+    if degree > 1:
+        c = 1.0925484305920792
+        basis += [c * x * y, -c * y * z, 0.31539156525252005 * (2 * z * z - x * x - y * y)]
+        basis += [-c * x * z, 0.5462742152960396 * (x * x - y * y)]
+    if degree > 2:
+        round_, axis = 4 * z * z - x * x - y * y, 0.4570457994644658
+        basis += [-0.5900435899266435 * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z, -axis * y * round_]
+        basis += [0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y), -axis * x * round_]
+        basis += [1.445305721320277 * z * (x * x - y * y), -0.5900435899266435 * x * (x * x - 3 * y * y)]
+    return jnp.stack(basis, 1)
+
+
+def project_splats(splats: Splats, camera: Camera, config: RenderConfig) -> Projected:
+    """EWA projection from the factor: 2D covariance = (J W M)(J W M)ᵀ + dilation (Zwicker et al. 2001)."""
+    fx, fy = camera.focal
+    cx, cy = camera.centre
+    x, y, depth = to_camera(splats.means, camera).T
+    ahead = depth > config.near
+    z = jnp.where(ahead, depth, 1.0)
+    u, v = x / z, y / z
+    margin_x, margin_y = _FOV_MARGIN * camera.width / (2 * fx), _FOV_MARGIN * camera.height / (2 * fy)
+    held_u = jnp.clip(u, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
+    held_v = jnp.clip(v, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
+    rotated = jnp.einsum("ij,njk->ink", camera.world_to_cam[:3, :3], splats.factors)
+    row_x = (rotated[0] - held_u[:, None] * rotated[2]) * (fx / z)[:, None]
+    row_y = (rotated[1] - held_v[:, None] * rotated[2]) * (fy / z)[:, None]
+    a, b, c = (jnp.sum(p * q, 1) for p, q in ((row_x, row_x), (row_x, row_y), (row_y, row_y)))
+    opacities = splats.opacities
+    if config.antialias:
+        bare = jnp.maximum(a * c - b * b, 0.0)
+        a, c = a + config.dilation, c + config.dilation
+        opacities = opacities * safe_sqrt(bare / (a * c - b * b))
+    else:
+        a, c = a + config.dilation, c + config.dilation
+    # a needle's a·c and b·b cancel in float32; the dilated determinant is at least dilation²
+    determinant = jnp.maximum(a * c - b * b, max(config.dilation**2, jnp.finfo(a.dtype).tiny))
+    conics = jnp.stack([c, -b, a], 1) / determinant[:, None]
+    centres = jnp.stack([fx * u + cx, fy * v + cy], 1)
+
+    faint = jnp.log(jnp.maximum(opacities / max(config.alpha_min, jnp.finfo(a.dtype).tiny), 1.0))
+    radii = lax.stop_gradient(jnp.sqrt(2 * faint[:, None] * jnp.stack([a, c], 1)))
+    size = jnp.array([camera.width, camera.height], centres.dtype)
+    on_image = jnp.all((centres + radii > 0) & (centres - radii < size), 1)
+    visible = ahead & (opacities >= config.alpha_min) & (opacities > 0) & on_image
+    return Projected(centres, conics, opacities, depth, radii, visible)
