@@ -68,27 +68,10 @@ def eigh(symmetric: Matrices) -> tuple[Vectors, Matrices]:
     symmetric = (symmetric + jnp.swapaxes(symmetric, -1, -2)) / 2
     scale = _power_of_two(jnp.abs(symmetric).max((-2, -1)))
     a = jnp.moveaxis(symmetric, (-2, -1), (0, 1)) / scale
-    eye = _identities(a)
-
-    def rotate(p, q, beside_p, beside_q, pq):
-        """Zero the entry `pq` between diagonals p and q; the columns beside them turn along."""
-        c, s, t = _rotation_angle(p, q, pq, jnp.maximum(jnp.abs(p), jnp.abs(q)) * jnp.finfo(a.dtype).tiny)
-        return p - t * pq, q + t * pq, *_turn(beside_p, beside_q, c, s)
-
-    def sweep(_, state):
-        (d0, d1, d2), (o01, o02, o12), (q0, q1, q2) = state
-        d0, d1, x, y = rotate(d0, d1, jnp.stack([o02, *q0]), jnp.stack([o12, *q1]), o01)
-        o02, q0, o12, q1, o01 = x[0], x[1:], y[0], y[1:], jnp.zeros_like(o01)
-        d0, d2, x, y = rotate(d0, d2, jnp.stack([o01, *q0]), jnp.stack([o12, *q2]), o02)
-        o01, q0, o12, q2, o02 = x[0], x[1:], y[0], y[1:], jnp.zeros_like(o02)
-        d1, d2, x, y = rotate(d1, d2, jnp.stack([o01, *q1]), jnp.stack([o02, *q2]), o12)
-        o01, q1, o02, q2, o12 = x[0], x[1:], y[0], y[1:], jnp.zeros_like(o12)
-        return (d0, d1, d2), (o01, o02, o12), (q0, q1, q2)
-
-    state = (a[0, 0], a[1, 1], a[2, 2]), (a[0, 1], a[0, 2], a[1, 2]), (eye[:, 0], eye[:, 1], eye[:, 2])
-    values, _, vectors = lax.fori_loop(0, _SWEEPS, sweep, state)
-    vectors, values = _sort(vectors, [-w for w in values])
-    w = -jnp.stack(values, -1) * scale[..., None]
+    q = _identities(a)
+    state = (a[0, 0], a[1, 1], a[2, 2]), (a[0, 1], a[0, 2], a[1, 2]), (q[:, 0], q[:, 1], q[:, 2])
+    values, _, vectors = lax.fori_loop(0, _SWEEPS, lambda _, state: _two_sided_sweep(*state), state)
+    w = jnp.stack(values, -1) * scale[..., None]
     return w, jnp.moveaxis(jnp.stack(vectors, 1), (0, 1), (-2, -1))
 
 
@@ -104,7 +87,8 @@ def _eigh_jvp(primals, tangents):
 
 def matmul3(a: Matrices, b: Matrices) -> Matrices:
     """Product of 3x3 matrices in full precision on every backend."""
-    return sum(a[..., :, k, None] * b[..., None, k, :] for k in range(3))
+    first, second, third = (a[..., :, k, None] * b[..., None, k, :] for k in range(3))
+    return first + second + third
 
 
 def transpose(matrix: Matrices) -> Matrices:
@@ -161,13 +145,13 @@ def matrix_to_quat(rotation: Matrices) -> Quaternions:
     m = jnp.moveaxis(rotation, (-2, -1), (0, 1))
     wx, wy, wz = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
     xy, xz, yz = m[1, 0] + m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2]
-    products = [  # 4 q qᵀ: any row is the quaternion, the one with the largest diagonal is never short
+    rows = [  # 4 q qᵀ: any row is the quaternion, the one with the largest diagonal is never short
         [1 + m[0, 0] + m[1, 1] + m[2, 2], wx, wy, wz],
         [wx, 1 + m[0, 0] - m[1, 1] - m[2, 2], xy, xz],
         [wy, xy, 1 - m[0, 0] + m[1, 1] - m[2, 2], yz],
         [wz, xz, yz, 1 - m[0, 0] - m[1, 1] + m[2, 2]],
     ]
-    products = jnp.stack([jnp.stack(row, -1) for row in products], -2)
+    products = jnp.stack([jnp.stack(row, -1) for row in rows], -2)
     largest = jnp.argmax(jnp.diagonal(products, axis1=-2, axis2=-1), -1)
     quats = safe_normalize(jnp.take_along_axis(products, largest[..., None, None], -2)[..., 0, :])
     return jnp.where(quats[..., :1] < 0, -quats, quats)
@@ -193,9 +177,10 @@ def _decompose(matrix):
     m = jnp.moveaxis(matrix, (-2, -1), (0, 1)) / scale
     columns = jnp.concatenate([m, _identities(m)])
     columns = lax.fori_loop(0, _SWEEPS, lambda _, c: _one_sided_sweep(*c), tuple(columns[:, j] for j in range(3)))
-    (a, b, c), _ = _sort(columns, [_dot(x[:3], x[:3]) for x in columns])
-    first, u0 = _length_and_direction(a[:3], jnp.zeros_like(a[:3]).at[0].set(1.0))
-    second, u1 = _length_and_direction(b[:3] - _dot(u0, b[:3]) * u0, _perpendicular(u0))
+    a, b, c = columns
+    first, u0 = _length_and_direction(a[:3], 0.0, jnp.zeros_like(a[:3]).at[0].set(1.0))
+    parallel = jnp.finfo(m.dtype).eps * _dot(b[:3], b[:3])
+    second, u1 = _length_and_direction(b[:3] - _dot(u0, b[:3]) * u0, parallel, _perpendicular(u0))
     u2 = jnp.cross(u0, u1, axis=0)
     u = jnp.moveaxis(jnp.stack([u0, u1, u2], 1), (0, 1), (-2, -1))
     s = jnp.stack([first, second, _dot(u2, c[:3])], -1) * scale[..., None]
@@ -254,7 +239,7 @@ def _skew(vector):
 
 
 def _one_sided_sweep(a, b, c):
-    """Make each pair of columns orthogonal in turn; their lower halves collect the rotation."""
+    """Make each pair of columns orthogonal in turn, the longer one first; their lower halves collect the rotation."""
     a, b = _orthogonalize(a, b)
     a, c = _orthogonalize(a, c)
     b, c = _orthogonalize(b, c)
@@ -263,8 +248,26 @@ def _one_sided_sweep(a, b, c):
 
 def _orthogonalize(a, b):
     aa, bb, ab = _dot(a[:3], a[:3]), _dot(b[:3], b[:3]), _dot(a[:3], b[:3])
-    cos, sin, _ = _rotation_angle(aa, bb, ab, jnp.finfo(a.dtype).eps * jnp.sqrt(aa * bb))
-    return _turn(a, b, cos, sin)
+    cos, sin, tan = _rotation_angle(aa, bb, ab, jnp.finfo(a.dtype).eps * jnp.sqrt(aa * bb))
+    return _turn(a, b, *_exchange(aa - tan * ab < bb + tan * ab, cos, sin))
+
+
+def _two_sided_sweep(diagonal, off, vectors):
+    """Zero the entries beside the diagonal in turn, the lower eigenvalue first."""
+    (w0, w1, w2), (o01, o02, o12), (q0, q1, q2) = diagonal, off, vectors
+    w0, w1, o01, o02, o12, q0, q1 = _diagonalize(w0, w1, o01, o02, o12, q0, q1)
+    w0, w2, o02, o01, o12, q0, q2 = _diagonalize(w0, w2, o02, o01, o12, q0, q2)
+    w1, w2, o12, o01, o02, q1, q2 = _diagonalize(w1, w2, o12, o01, o02, q1, q2)
+    return (w0, w1, w2), (o01, o02, o12), (q0, q1, q2)
+
+
+def _diagonalize(p, q, pq, rp, rq, vector_p, vector_q):
+    """Turn axes p and q until pq is zero; rp and rq couple them to the third axis."""
+    cos, sin, tan = _rotation_angle(p, q, pq, jnp.finfo(p.dtype).tiny)
+    p, q = p - tan * pq, q + tan * pq
+    cos, sin = _exchange(p > q, cos, sin)
+    rp, rq = _turn(rp, rq, cos, sin)
+    return jnp.minimum(p, q), jnp.maximum(p, q), jnp.zeros_like(pq), rp, rq, *_turn(vector_p, vector_q, cos, sin)
 
 
 def _rotation_angle(p, q, pq, negligible):
@@ -281,20 +284,15 @@ def _turn(a, b, cos, sin):
     return cos * a - sin * b, sin * a + cos * b
 
 
-def _sort(columns, keys):
-    """Columns in the order of falling keys; each exchange negates one of the two, which keeps the determinant."""
-    columns, keys = list(columns), list(keys)
-    for i, j in ((0, 1), (0, 2), (1, 2)):
-        swap = keys[i] < keys[j]
-        columns[i], columns[j] = jnp.where(swap, columns[j], columns[i]), jnp.where(swap, -columns[i], columns[j])
-        keys[i], keys[j] = jnp.maximum(keys[i], keys[j]), jnp.minimum(keys[i], keys[j])
-    return columns, keys
+def _exchange(condition, cos, sin):
+    """A quarter turn more where the condition holds: the two columns trade places, one of them negated."""
+    return jnp.where(condition, sin, cos), jnp.where(condition, -cos, sin)
 
 
-def _length_and_direction(vector, fallback):
-    """Length and unit direction along axis 0, or zero and the fallback where the square has lost digits."""
+def _length_and_direction(vector, noise, fallback):
+    """Length and unit direction along axis 0, or zero and the fallback where the square is noise or underflows."""
     squared = _dot(vector, vector)
-    positive = squared > jnp.finfo(vector.dtype).tiny / jnp.finfo(vector.dtype).eps
+    positive = squared > jnp.maximum(noise, jnp.finfo(vector.dtype).tiny / jnp.finfo(vector.dtype).eps)
     length = jnp.where(positive, jnp.sqrt(squared), 0.0)
     return length, jnp.where(positive, vector / jnp.where(positive, length, 1.0), fallback)
 
