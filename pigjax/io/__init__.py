@@ -1,0 +1,32 @@
+"""Files: the only package that touches them. Everything here runs on the host."""
+
+from pigjax.io.cameras import Views, load_cameras, load_views
+from pigjax.io.files import read_json, write_json
+from pigjax.io.images import contact_sheet, read_image, write_image
+from pigjax.io.masks import load_masks, save_masks
+from pigjax.io.ply import load_ply, load_points, read_ply, save_ply
+from pigjax.io.state import last_state, load_pytree, load_state, save_pytree, save_state
+from pigjax.io.video import write_video
+
+__all__ = [
+    "Views",
+    "contact_sheet",
+    "last_state",
+    "load_cameras",
+    "load_masks",
+    "load_ply",
+    "load_points",
+    "load_pytree",
+    "load_state",
+    "load_views",
+    "read_image",
+    "read_json",
+    "read_ply",
+    "save_masks",
+    "save_ply",
+    "save_pytree",
+    "save_state",
+    "write_image",
+    "write_json",
+    "write_video",
+]

@@ -1,0 +1,228 @@
+"""Posed photos: `Views`, and `load_views`, which knows the formats by their content."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from PIL import Image
+
+from pigjax.camera import Camera
+from pigjax.errors import InputError
+from pigjax.io.capture import Capture, Shot
+from pigjax.io.colmap import find_model, read_model
+from pigjax.io.files import PathLike, existing, existing_folder, read_json
+from pigjax.io.images import Background, open_rgb
+from pigjax.io.json_cameras import read_inria_cameras, read_transforms
+from pigjax.io.masks import load_masks
+
+
+class Views(eqx.Module):
+    """Posed photos of one scene, all of one size.
+
+    Pictures and masks stay in host memory as NumPy arrays until someone computes with them.
+    """
+
+    cameras: Camera  # batch of t
+    names: tuple[str, ...] = eqx.field(static=True)  # file names without suffix; with folders where they would repeat
+    images: Float[np.ndarray | Array, "t h w 3"]  # RGB in 0..1
+    masks: Int[np.ndarray | Array, "t h w"] | None  # object ids
+    splits: tuple[str, ...] = eqx.field(static=True)  # "train", "test", ...
+    points_path: Path | None = eqx.field(static=True, default=None)  # sparse cloud for `load_points`
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> Views:
+        """The chosen views, in that order; one index gives `Views` of length 1."""
+        chosen = np.atleast_1d(np.arange(len(self))[index])
+        return Views(
+            cameras=self.cameras[chosen],
+            names=tuple(self.names[i] for i in chosen),
+            images=self.images[chosen],
+            masks=None if self.masks is None else self.masks[chosen],
+            splits=tuple(self.splits[i] for i in chosen),
+            points_path=self.points_path,
+        )
+
+    def subset(self, split: str) -> Views:
+        """Views of one split.
+
+        Raises:
+            InputError: no view belongs to it.
+        """
+        return self[_of_split(self.splits, split, "Views")]
+
+
+def load_views(
+    path: PathLike,
+    *,
+    images: PathLike | None = None,
+    masks: PathLike | bool | None = None,
+    merge: Mapping[int, int] | None = None,
+    missing_masks: str = "error",
+    split: str | None = None,
+    max_size: int | None = None,
+    hold_out: int = 8,
+    background: Background = 0.0,
+) -> Views:
+    """Photos with their cameras, and masks if asked for. Host.
+
+    The format is known by content: nerfstudio's `transforms.json` or Blender NeRF's `transforms_train.json` (and its
+    siblings), INRIA's `cameras.json`, or a COLMAP sparse model (text or binary, in the folder itself or in `sparse/0`).
+
+    Args:
+        path: one of these files, or the folder that holds it.
+        images: folder of the photos, where they are not where the file says (for COLMAP and INRIA: `images`).
+        masks: folder of instance masks (see `load_masks`); True means `object_mask` beside the photos' folder.
+        merge: mask ids to replace, {3: 2} turns 3 into 2.
+        missing_masks: "error", or "empty": a view without a mask gets background everywhere.
+        split: load only the views of this split.
+        max_size: shrink photos so that neither side is longer [px]; intrinsics follow.
+        hold_out: where the file assigns no splits, every n-th view is "test", from the first on, as in 3DGS; 0 or fewer
+            views than that: all are "train".
+        background: colour behind transparent photos, in 0..1.
+
+    Raises:
+        MissingFileError: the file or a photo or mask does not exist.
+        InputError: unknown or damaged format, camera model that is no pinhole, pose that is not rigid, photos whose
+            size contradicts the camera or differs from view to view, or no views in the split.
+    """
+    capture = _read_capture(path, images)
+    splits = _splits(capture, hold_out)
+    chosen = range(len(splits)) if split is None else _of_split(splits, split, str(path))
+    shots = [capture.shots[i] for i in chosen]
+    sizes = [_target_size(shot, max_size) for shot in shots]
+    _check_one_size(shots, sizes)
+    with ThreadPoolExecutor() as pool:
+        pictures = list(pool.map(lambda shot, size: _picture(shot, size, background), shots, sizes))
+    names = _names([shot.image for shot in shots])
+    folder = capture.root / "object_mask" if masks is True else masks
+    return Views(
+        cameras=_cameras(shots, sizes),
+        names=names,
+        images=np.stack(pictures),
+        masks=load_masks(folder, names, sizes[0], merge=merge, missing=missing_masks) if folder else None,
+        splits=tuple(splits[i] for i in chosen),
+        points_path=capture.points,
+    )
+
+
+def load_cameras(path: PathLike, *, max_size: int | None = None) -> tuple[Camera, tuple[str, ...]]:
+    """Cameras and names as `load_views` gives them, for drawing where there are no photos. Host.
+
+    Raises:
+        MissingFileError: the file does not exist.
+        InputError: unknown or damaged format, camera model that is no pinhole, or pose that is not rigid.
+    """
+    shots = _read_capture(path, None).shots
+    sizes = [_target_size(shot, max_size) for shot in shots]
+    _check_one_size(shots, sizes)
+    return _cameras(shots, sizes), _names([shot.image for shot in shots])
+
+
+def _read_capture(path: PathLike, images: PathLike | None) -> Capture:
+    path = existing(path, "file or folder of views")
+    folder = None if images is None else existing_folder(images, "folder of photos")
+    capture = _read_json_capture(path, folder) if path.is_file() else _read_folder(path, folder)
+    if not capture.shots:
+        raise InputError(f"{path}: lists no views; give a file with at least one.")
+    return capture
+
+
+def _read_json_capture(path: Path, images: Path | None, split: str | None = None) -> Capture:
+    content = read_json(path)
+    if isinstance(content, dict) and "frames" in content:
+        return read_transforms(path, images=images, split=split)
+    if isinstance(content, list):
+        return read_inria_cameras(path, images=images)
+    raise InputError(f"{path}: neither transforms.json (an object with 'frames') nor cameras.json (a list); give one.")
+
+
+def _read_folder(folder: Path, images: Path | None) -> Capture:
+    for name in ("transforms.json", "cameras.json"):
+        if (folder / name).is_file():
+            return _read_json_capture(folder / name, images)
+    blender = {split: folder / f"transforms_{split}.json" for split in ("train", "val", "test")}
+    parts = [_read_json_capture(file, images, split) for split, file in blender.items() if file.is_file()]
+    if parts:
+        return Capture(folder, tuple(shot for part in parts for shot in part.shots), parts[0].points)
+    model = find_model(folder)
+    if model is not None:
+        roots = (folder, *folder.resolve().parents[:2])
+        root = next((at for at in roots if (at / "images").is_dir()), folder)
+        return read_model(model, root=root, images=images)
+    raise InputError(
+        f"{folder}: holds no views in a known format; give a folder with transforms.json, cameras.json or a COLMAP"
+        " model in sparse/0."
+    )
+
+
+def _splits(capture: Capture, hold_out: int) -> list[str]:
+    given = [shot.split for shot in capture.shots]
+    if any(given) or not 0 < hold_out <= len(given):
+        return [split or "train" for split in given]
+    return ["train" if i % hold_out else "test" for i in range(len(given))]
+
+
+def _of_split(splits: Sequence[str], split: str, where: str) -> list[int]:
+    found = [i for i, name in enumerate(splits) if name == split]
+    if not found:
+        counts = ", ".join(f"{name} ({splits.count(name)})" for name in sorted(set(splits)))
+        raise InputError(f"{where}: no views in split {split!r}; choose one of {counts}.")
+    return found
+
+
+def _target_size(shot: Shot, max_size: int | None) -> tuple[int, int]:
+    longest = max(shot.size)
+    if max_size is None or longest <= max_size:
+        return shot.size
+    if max_size < 1:
+        raise InputError(f"max_size = {max_size}: it must be at least 1 px.")
+    width, height = (max(1, round(extent * max_size / longest)) for extent in shot.size)
+    return width, height
+
+
+def _check_one_size(shots: Sequence[Shot], sizes: Sequence[tuple[int, int]]) -> None:
+    for shot, size in zip(shots, sizes):
+        if size != sizes[0]:
+            raise InputError(
+                f"{shot.where}: {shot.image.name} is {size[0]}x{size[1]} but {shots[0].image.name} is"
+                f" {sizes[0][0]}x{sizes[0][1]}; views must have one size: crop them, or give max_size."
+            )
+
+
+def _picture(shot: Shot, size: tuple[int, int], background: Background) -> Float[np.ndarray, "h w 3"]:
+    picture = open_rgb(shot.image, background=background)
+    if picture.size != shot.size:
+        raise InputError(
+            f"{shot.image}: image is {picture.width}x{picture.height} but its camera ({shot.where}) says"
+            f" {shot.size[0]}x{shot.size[1]}; give the photos the cameras were made for (max_size shrinks them)."
+        )
+    if picture.size != size:
+        picture = picture.resize(size, Image.Resampling.BOX)
+    return np.asarray(picture, np.float32) / 255
+
+
+def _cameras(shots: Sequence[Shot], sizes: Sequence[tuple[int, int]]) -> Camera:
+    factors = np.array(sizes) / np.array([shot.size for shot in shots])
+    return Camera(
+        jnp.asarray(np.stack([shot.world_to_cam for shot in shots])),
+        jnp.asarray(np.array([shot.focal for shot in shots]) * factors),
+        jnp.asarray(np.array([shot.centre for shot in shots]) * factors),
+        *sizes[0],
+    )
+
+
+def _names(photos: Sequence[Path]) -> tuple[str, ...]:
+    stems = tuple(photo.stem for photo in photos)
+    if len(set(stems)) == len(stems):
+        return stems
+    common = os.path.commonpath([photo.parent for photo in photos])
+    return tuple(photo.relative_to(common).with_suffix("").as_posix() for photo in photos)

@@ -1,0 +1,215 @@
+"""COLMAP's sparse models, text and binary (https://colmap.github.io/format.html)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from pigjax.errors import InputError
+from pigjax.io.capture import Capture, Shot, check_intrinsics, check_pinhole, find_image, rigid
+from pigjax.io.files import existing
+
+# Names of the parameters after the focal lengths and the principal point, in the order of COLMAP's model numbers.
+_PARAMETERS: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+_BINARY_MODELS = tuple(_PARAMETERS)
+_PINHOLES = tuple(name for name in _PARAMETERS if name != "OPENCV_FISHEYE")
+_PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0")
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """One line of `cameras`."""
+
+    model: str
+    size: tuple[int, int]
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Pose:
+    """One entry of `images`."""
+
+    name: str
+    quat: tuple[float, ...]  # wxyz, world to camera
+    shift: tuple[float, ...]
+    lens: int
+
+
+def find_model(folder: Path) -> Path | None:
+    """The folder in or under `folder` that holds a sparse model."""
+    places = (folder / place for place in _PLACES)
+    return next((at for at in places if any((at / f"images{kind}").is_file() for kind in (".bin", ".txt"))), None)
+
+
+def read_model(model: Path, *, root: Path, images: Path | None = None) -> Capture:
+    """Shots of a sparse model, in the order of their names; photos are in `root`/images unless `images` says where.
+
+    Raises:
+        MissingFileError: a file of the model is missing.
+        InputError: the model is damaged, a camera is no pinhole, or a pose is not rigid.
+    """
+    kind = ".bin" if (model / "images.bin").is_file() else ".txt"
+    cameras_file, images_file = existing(model / f"cameras{kind}", "file"), existing(model / f"images{kind}", "file")
+    try:
+        lenses = dict(_binary_cameras(cameras_file) if kind == ".bin" else _text_cameras(cameras_file))
+    except (struct.error, ValueError, IndexError) as error:
+        raise _damaged(cameras_file, error) from None
+    try:
+        poses = list(_binary_images(images_file) if kind == ".bin" else _text_images(images_file))
+    except (struct.error, ValueError, IndexError) as error:
+        raise _damaged(images_file, error) from None
+    for number, lens in lenses.items():
+        _check_lens(lens, f"{cameras_file}: camera {number}")
+    folder = images or root / "images"
+    shots = tuple(_shot(pose, lenses, folder, images_file) for pose in sorted(poses, key=lambda pose: pose.name))
+    points = (model / f"points3D{suffix}" for suffix in (".bin", ".txt", ".ply"))
+    return Capture(root, shots, next((path for path in points if path.is_file()), None))
+
+
+def read_points3d(path: Path) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Positions and RGB in 0..1 of `points3D.bin` or `points3D.txt`.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    try:
+        rows = list(_binary_points(path) if path.suffix == ".bin" else _text_points(path))
+    except (struct.error, ValueError, IndexError) as error:
+        raise _damaged(path, error) from None
+    table = np.asarray(rows, np.float32).reshape(-1, 6)
+    return table[:, :3], table[:, 3:] / 255
+
+
+def _damaged(path: Path, error: Exception) -> InputError:
+    if isinstance(error, InputError):
+        return error
+    return InputError(f"{path}: not a complete COLMAP file ({error}); copy or export the model again.")
+
+
+def _check_lens(lens: _Lens, where: str) -> None:
+    names = _PARAMETERS.get(lens.model, ())
+    bends = {name: value for name, value in zip(names, lens.values) if name[0] in "kp"}
+    check_pinhole(lens.model, bends, where, _PINHOLES)
+    if len(lens.values) != len(names):
+        raise InputError(f"{where}: {lens.model} has {len(names)} parameters, not {len(lens.values)}; export it again.")
+    check_intrinsics(_focal(lens), lens.size, where)
+
+
+def _focal(lens: _Lens) -> tuple[float, float]:
+    return (lens.values[0], lens.values[_PARAMETERS[lens.model].index("cx") - 1])
+
+
+def _shot(pose: _Pose, lenses: dict[int, _Lens], folder: Path, file: Path) -> Shot:
+    where = f"{file}: image {pose.name!r}"
+    if pose.lens not in lenses:
+        raise InputError(f"{where}: names camera {pose.lens}, which the model lacks; export the model again.")
+    lens = lenses[pose.lens]
+    first = _PARAMETERS[lens.model].index("cx")
+    centre = (lens.values[first], lens.values[first + 1])
+    world_to_cam = np.eye(4)
+    world_to_cam[:3, :3] = _rotation(np.asarray(pose.quat))
+    world_to_cam[:3, 3] = pose.shift
+    return Shot(where, find_image(folder, pose.name), rigid(world_to_cam, where), _focal(lens), centre, lens.size)
+
+
+def _rotation(quat: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+    """Rotation of a wxyz quaternion of any length; zero gives zeros, which no pose check lets pass."""
+    length = np.linalg.norm(quat)
+    if length == 0:
+        return np.zeros((3, 3))
+    w, axis = quat[0] / length, quat[1:] / length
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
+
+
+def _text_lines(path: Path) -> list[str]:
+    return [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, _Lens]]:
+    for line in filter(None, _text_lines(path)):
+        number, model, width, height, *values = line.split()
+        yield int(number), _Lens(model, (int(width), int(height)), tuple(map(float, values)))
+
+
+def _text_images(path: Path) -> Iterator[_Pose]:
+    lines = iter(_text_lines(path))
+    for line in lines:
+        if line.strip():
+            _, *numbers, lens, name = line.split(maxsplit=9)
+            quat_shift = tuple(map(float, numbers))
+            yield _Pose(name.strip(), quat_shift[:4], quat_shift[4:], int(lens))
+            next(lines, None)  # observed points: one line, empty where there are none
+
+
+def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
+    for line in filter(None, _text_lines(path)):
+        yield tuple(map(float, line.split()[1:7]))
+
+
+class _Reader:
+    """Little-endian values from a file, one after the other."""
+
+    def __init__(self, path: Path):
+        self.data = path.read_bytes()
+        self.at = 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        values = struct.unpack_from(f"<{layout}", self.data, self.at)
+        self.at += struct.calcsize(f"<{layout}")
+        return values
+
+    def skip(self, size: int) -> None:
+        self.at += size
+        if self.at > len(self.data):
+            raise ValueError(f"ends after {len(self.data)} bytes")
+
+    def text(self) -> str:
+        end = self.data.index(b"\0", self.at)
+        start, self.at = self.at, end + 1
+        return self.data[start:end].decode("utf-8")
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, _Lens]]:
+    reader = _Reader(path)
+    for _ in range(*reader.take("Q")):
+        number, kind, width, height = reader.take("IiQQ")
+        if not 0 <= kind < len(_BINARY_MODELS):
+            raise InputError(
+                f"{path}: camera {number} has camera model number {kind}, which is not known ({', '.join(_PINHOLES)});"
+                " undistort the images to a PINHOLE model."
+            )
+        model = _BINARY_MODELS[kind]
+        yield number, _Lens(model, (width, height), reader.take(f"{len(_PARAMETERS[model])}d"))
+
+
+def _binary_images(path: Path) -> Iterator[_Pose]:
+    reader = _Reader(path)
+    for _ in range(*reader.take("Q")):
+        _, *quat_shift, lens = reader.take("I7dI")
+        name = reader.text()
+        (observations,) = reader.take("Q")
+        reader.skip(24 * observations)
+        yield _Pose(name, tuple(quat_shift[:4]), tuple(quat_shift[4:]), lens)
+
+
+def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
+    reader = _Reader(path)
+    for _ in range(*reader.take("Q")):
+        _, x, y, z, red, green, blue, _, track = reader.take("Q3d3BdQ")
+        reader.skip(8 * track)
+        yield x, y, z, red, green, blue
