@@ -103,7 +103,8 @@ def load_views(
     with ThreadPoolExecutor() as pool:
         pictures = list(pool.map(lambda shot, size: _picture(shot, size, background), shots, sizes))
     names = _names([shot.image for shot in shots])
-    folder = capture.root / "object_mask" if masks is True else masks
+    home = capture.root if images is None else Path(images).parent
+    folder = home / "object_mask" if masks is True else masks
     return Views(
         cameras=_cameras(shots, sizes),
         names=names,

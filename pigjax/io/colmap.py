@@ -150,15 +150,16 @@ def _text_images(path: Path) -> Iterator[_Pose]:
     lines = iter(_text_lines(path))
     for line in lines:
         if line.strip():
-            _, *numbers, lens, name = line.split(maxsplit=9)
-            quat_shift = tuple(map(float, numbers))
-            yield _Pose(name.strip(), quat_shift[:4], quat_shift[4:], int(lens))
+            _, w, x, y, z, *shift, lens, name = line.split(maxsplit=9)
+            quat = (float(w), float(x), float(y), float(z))
+            yield _Pose(name.strip(), quat, (float(shift[0]), float(shift[1]), float(shift[2])), int(lens))
             next(lines, None)  # observed points: one line, empty where there are none
 
 
 def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
     for line in filter(None, _text_lines(path)):
-        yield tuple(map(float, line.split()[1:7]))
+        _, x, y, z, red, green, blue, *_ = line.split()
+        yield float(x), float(y), float(z), float(red), float(green), float(blue)
 
 
 class _Reader:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, Integer
 from PIL import Image
 
 from pigjax.errors import InputError, MissingFileError
@@ -64,7 +64,7 @@ def load_masks(
     return _merged(masks, merge or {})
 
 
-def save_masks(folder: PathLike, names: Sequence[str], masks: Int[np.ndarray | Array, "t h w"]) -> None:
+def save_masks(folder: PathLike, names: Sequence[str], masks: Integer[np.ndarray | Array, "t h w"]) -> None:
     """Write `<name>.png`, 8-bit where all ids fit, else 16-bit. Host.
 
     Raises:
@@ -90,9 +90,9 @@ def _read_ids(path: Path) -> Int[np.ndarray, "h w"]:
         ids = _deva_ids(path, ids)
     if ids.ndim != 2 or not (np.issubdtype(ids.dtype, np.integer) or ids.dtype == bool):
         raise InputError(f"{path}: mask is {ids.dtype} {ids.shape}; save whole-number ids [h, w].")
-    if ids.size and ids.min() < 0:
-        raise InputError(f"{path}: mask has id {ids.min()}; ids must be >= 0 (0 is background).")
-    return ids
+    if ids.size and not 0 <= ids.min() <= ids.max() < 2**31:
+        raise InputError(f"{path}: mask ids reach from {ids.min()} to {ids.max()}; use 0 (background) to 2³¹ - 1.")
+    return ids.astype(np.int32)
 
 
 def _read_array(path: Path) -> np.ndarray:
