@@ -1,0 +1,352 @@
+"""Objects from instance masks: the views vote on the id of every Gaussian (PIG, section 3.2)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int, Integer, Num
+from scipy.spatial import cKDTree
+
+from pigjax.arrays import array_field
+from pigjax.camera import Camera, project
+from pigjax.errors import InputError
+from pigjax.splat import Gaussians, RenderConfig, Splats, as_splats, render, required_capacity
+from pigjax.tile_walks import credits_of_candidates, soft_surface_depth
+
+Scalar = Float[Array, ""] | float
+_TIED_IDS = 4  # of more ids with equal votes, the lowest four compete
+_IDS_TOGETHER = 32  # ids credited in one pass of weighting = "alpha", which bounds its memory
+
+
+class Labels(eqx.Module):
+    """The object that each Gaussian belongs to, and how the views voted."""
+
+    object_id: Int[Array, "n"] = array_field()  # 0 = background or contested, -1 = never seen
+    votes: Num[Array, "n m"] = array_field()  # views (or alpha·T, or soft counts) for each id, background in column 0
+    confidence: Float[Array, "n"] = array_field()  # share of the votes that the winner took, 0 where never seen
+    overflow: Int[Array, ""] | None = None  # box/tile pairs that the renderer dropped, over all views
+
+
+def lift_masks(
+    gaussians: Gaussians | Splats,
+    cameras: Camera,
+    masks: Integer[Array | np.ndarray, "t h w"],
+    *,
+    num_ids: int,
+    tau_T: Scalar = 0.5,
+    tau_d: Scalar = 0.03,
+    temperature: Scalar | None = None,
+    background: Literal["ignore", "vote"] = "ignore",
+    weighting: Literal["centre", "alpha"] = "centre",
+    ties: Literal["alpha", "lowest"] = "alpha",
+    min_votes: Scalar | int = 1,
+    purity: Scalar = 0.0,
+    config: RenderConfig = RenderConfig(),  # noqa: B008  (frozen)
+) -> Labels:
+    """Give every Gaussian the id that most views see at its place (PIG, section 3.2).
+
+    In each view a Gaussian at camera depth z whose centre falls in a pixel with surface depth d votes for the id of
+    that pixel if |z - d| <= tau_d·d. Behind the near plane, outside the image or without a surface it has no vote.
+
+    Views are streamed: memory is one [n num_ids] array of counts, in the narrowest integer that holds the views.
+    `vmap` over `tau_T` and `tau_d` sweeps them. Outside `jit` the renderer gets the capacity that the cameras need;
+    inside, or where `config.capacity` is set, that capacity holds and `Labels.overflow` counts what was dropped.
+
+    Args:
+        gaussians: the scene.
+        cameras: batch of posed views.
+        masks: id of every pixel in every view, 0 = background, the same id for the same object in all views.
+        num_ids: ids run from 0 to num_ids - 1.
+        tau_T: transmittance below which the surface lies, in [0, 1].
+        tau_d: depth tolerance relative to the surface depth, in [0, 1].
+        temperature: None for the hard vote; a positive number makes both tests sigmoids of that width (in units of
+            transmittance and of relative depth), votes soft counts, and `votes` and `confidence` differentiable with
+            respect to tau_T, tau_d, Gaussians and cameras. What stays discrete is the pixel that a centre falls in.
+        background: "ignore" lets id 0 win only where no object has a vote; "vote" lets it compete.
+        weighting: "centre" is the paper's vote; "alpha" instead credits each Gaussian with the alpha·T that it has in
+            the pixels of each id (FlashSplat's statistic; Shen et al. 2024), without thresholds.
+        ties: between ids with equal votes, "alpha" prefers the larger sum of alpha·T over the pixels of all views,
+            which costs a second pass over the tiles that hold tied Gaussians; "lowest" takes the lowest id at once.
+            Equal again: the lowest non-zero id. Soft counts and sums of alpha·T are not settled further.
+        min_votes: with fewer votes than this (soft counts are rounded) a Gaussian stays unseen, id -1.
+        purity: with a smaller share of the votes than this the winner is contested, and the id is 0.
+        config: the renderer's settings.
+
+    Raises:
+        InputError: no views, masks that do not fit the cameras, ids or thresholds out of range, unknown options.
+    """
+    _check_masks(cameras, masks, num_ids)
+    _check_choice("background", background, ("ignore", "vote"))
+    _check_choice("weighting", weighting, ("centre", "alpha"))
+    _check_choice("ties", ties, ("alpha", "lowest"))
+    for name, value in (("tau_T", tau_T), ("tau_d", tau_d), ("purity", purity)):
+        if _is_known(value) and not 0 <= float(value) <= 1:
+            raise InputError(f"{name} = {float(value):g}: it must lie in [0, 1].")
+    if temperature is not None:
+        if weighting == "alpha":
+            raise InputError("temperature has no thresholds to soften with weighting = 'alpha': leave it None.")
+        if _is_known(temperature) and not float(temperature) > 0:
+            raise InputError(f"temperature = {float(temperature):g}: it must be > 0, or None for the hard vote.")
+    dtype = gaussians.means.dtype
+    temperature = None if temperature is None else jnp.asarray(temperature, dtype)
+    thresholds = jnp.asarray(tau_T, dtype), jnp.asarray(tau_d, dtype), temperature
+    config = enough_capacity(gaussians, cameras, config)
+    splats, masks = as_splats(gaussians), jnp.asarray(masks)
+    votes, overflow = _collect(splats, cameras, masks, thresholds, num_ids, weighting, config)
+    counted = weighting == "centre" and temperature is None
+    rerun = jax.tree_util.Partial(_credit_candidates, splats, cameras, masks, config)
+    object_id, confidence = _elect(votes, background, min_votes, purity, rerun if counted and ties == "alpha" else None)
+    return Labels(object_id, votes, confidence, overflow)
+
+
+def object_mask(
+    gaussians: Gaussians | Splats,
+    labels: Labels,
+    object_id: Int[Array, ""] | int,
+    camera: Camera,
+    *,
+    mode: Literal["isolated", "visible"] = "isolated",
+    config: RenderConfig = RenderConfig(),  # noqa: B008
+) -> Float[Array, "h w"]:
+    """Coverage of one object in a view, 0 to 1.
+
+    Args:
+        gaussians: the scene.
+        labels: as `lift_masks` gives them.
+        object_id: the object; may be swept.
+        camera: a single camera.
+        mode: "isolated" draws the object's Gaussians alone, also where others hide it; "visible" is the object's share
+            of the pixel in the whole scene.
+        config: the renderer's settings. Outside `jit` a capacity of None becomes what the camera needs.
+
+    Raises:
+        InputError: unknown mode.
+    """
+    _check_choice("mode", mode, ("isolated", "visible"))
+    splats = as_splats(gaussians)
+    member = (labels.object_id == object_id).astype(splats.opacities.dtype)
+    if mode == "isolated":
+        alone = dataclasses.replace(splats, opacities=splats.opacities * member)
+        return _draw("alpha", alone, camera, enough_capacity(alone, camera, config))[0]
+    config = enough_capacity(splats, camera, config)
+    return _draw("object_weights", splats, camera, config, object_weights=member[:, None])[0][..., 0]
+
+
+def fill_unseen(gaussians: Gaussians | Splats, labels: Labels, k: int = 8) -> Labels:
+    """Give Gaussians that no view saw (id -1) the commonest id among their k nearest seen ones, host.
+
+    The nearest neighbour decides ties. The confidence of a filled Gaussian is its neighbours' agreement.
+
+    Raises:
+        InputError: no Gaussian was seen, or k < 1.
+    """
+    ids, means = np.array(labels.object_id), np.asarray(gaussians.means)
+    unseen = ids < 0
+    if k < 1:
+        raise InputError(f"k = {k}: at least one neighbour is needed.")
+    if unseen.all():
+        raise InputError("labels.object_id holds no seen Gaussian (all are -1): no neighbour can lend its id.")
+    if not unseen.any():
+        return labels
+    k = min(k, int((~unseen).sum()))
+    _, nearest = cKDTree(means[~unseen]).query(means[unseen], k=range(1, k + 1))
+    neighbours = ids[~unseen][nearest]
+    agreement = np.sum(neighbours[:, :, None] == neighbours[:, None, :], 2)
+    # argmax takes the first of equals, and neighbours come nearest first
+    best = np.argmax(agreement, 1)
+    rows = np.arange(len(best))
+    ids[unseen] = neighbours[rows, best]
+    confidence = np.array(labels.confidence)
+    confidence[unseen] = agreement[rows, best] / k
+    return Labels(jnp.asarray(ids), labels.votes, jnp.asarray(confidence), labels.overflow)
+
+
+def enough_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: RenderConfig) -> RenderConfig:
+    """The same settings with the capacity that these cameras need, rounded up to a power of two.
+
+    Left alone where the capacity was set by the caller or where inputs are traced, since shapes are static there.
+    """
+    if config.capacity is not None or not all(map(_is_known, jax.tree.leaves((gaussians, cameras)))):
+        return config
+    with jax.ensure_compile_time_eval():
+        needed = required_capacity(gaussians, cameras, config)
+    return dataclasses.replace(config, capacity=1 << max(needed - 1, 1).bit_length())
+
+
+@eqx.filter_jit
+def _collect(splats, cameras, masks, thresholds, num_ids, weighting, config):
+    """Votes [n m] of all views, and the pairs that the renderer dropped."""
+    tau_T, tau_d, temperature = thresholds
+    if weighting == "alpha":
+        dtype = splats.means.dtype
+
+        def count(votes, camera, mask):
+            credits, overflow = _credits(splats, camera, mask, num_ids, config)
+            return votes + credits, overflow
+
+    elif temperature is None:
+        dtype = np.min_scalar_type(len(cameras))
+
+        def count(votes, camera, mask):
+            pixel, seen, overflow = _hard_votes(splats, camera, tau_T, tau_d, config)
+            return _cast(votes, mask.ravel()[pixel], seen), overflow
+
+    else:
+        dtype = splats.means.dtype
+
+        def count(votes, camera, mask):
+            weigh = jax.checkpoint(lambda camera: _soft_votes(splats, camera, tau_T, tau_d, temperature, config))
+            pixel, weight, overflow = weigh(camera)
+            return _cast(votes, mask.ravel()[pixel], weight), overflow
+
+    def one_view(carry, view):
+        votes, overflow = count(carry[0], *view)
+        return (votes, carry[1] + overflow), None
+
+    start = jnp.zeros((len(splats), num_ids), dtype), jnp.zeros((), jnp.int32)
+    return lax.scan(one_view, start, (cameras, masks))[0]
+
+
+def _hard_votes(splats: Splats, camera: Camera, tau_T, tau_d, config: RenderConfig):
+    """The pixel under each centre, whether the centre lies on the surface there, and the pairs dropped."""
+    depth, overflow = _draw("surface_depth", splats, camera, config, tau_T=tau_T)
+    pixel, z, inside = _pixel_under(splats, camera, config)
+    depth = depth.ravel()[pixel]
+    # where there is no surface the depth is NaN, and no comparison holds
+    return pixel, inside & (jnp.abs(z - depth) <= depth * tau_d), overflow
+
+
+def _soft_votes(splats: Splats, camera: Camera, tau_T, tau_d, temperature, config: RenderConfig):
+    """As `_hard_votes`, with a weight between 0 and 1 in place of yes and no."""
+    depth, presence, overflow = soft_surface_depth(splats, camera, config, tau_T=tau_T, temperature=temperature)
+    pixel, z, inside = _pixel_under(splats, camera, config)
+    depth = depth.ravel()[pixel]
+    close = jax.nn.sigmoid((tau_d - jnp.abs(z - depth) / depth) / temperature)
+    return pixel, jnp.where(inside, presence.ravel()[pixel] * close, 0.0), overflow
+
+
+def _pixel_under(splats: Splats, camera: Camera, config: RenderConfig):
+    """Flat index of the pixel that each centre falls in, the centre's camera z [m], and whether it is in view."""
+    position, z = project(splats.means, camera)
+    size = jnp.array([camera.width, camera.height], position.dtype)
+    inside = (z > config.near) & jnp.all((position >= 0) & (position < size), 1)
+    column, row = jnp.where(inside[:, None], position, 0.0).astype(jnp.int32).T
+    return row * camera.width + column, z, inside
+
+
+def _cast(votes, ids, weight):
+    """Add one vote per Gaussian."""
+    rows = jnp.arange(votes.shape[0])
+    return votes.at[rows, ids].add(weight.astype(votes.dtype), mode="drop", unique_indices=True)
+
+
+def _credit_candidates(splats: Splats, cameras: Camera, masks, config: RenderConfig, candidates):
+    """Sum of alpha·T over all views and the pixels of each candidate id [n j]."""
+
+    def one_view(total, view):
+        camera, mask = view
+        return total + credits_of_candidates(splats, camera, config, mask, candidates), None
+
+    return lax.scan(one_view, jnp.zeros(candidates.shape, splats.means.dtype), (cameras, masks))[0]
+
+
+def _credits(splats: Splats, camera: Camera, mask, num_ids: int, config: RenderConfig):
+    """Sum of alpha·T over the pixels of each id [n m]: drawing is linear in the weights, and this is its transpose."""
+    reverse = dataclasses.replace(config, differentiation="reverse")
+    together = min(num_ids, _IDS_TOGETHER)
+
+    def of_ids(first):
+        def draw(weights):
+            return _draw("object_weights", splats, camera, reverse, object_weights=weights)
+
+        weights = jnp.zeros((len(splats), together), splats.means.dtype)
+        _, transpose, overflow = jax.vjp(draw, weights, has_aux=True)
+        return transpose(jax.nn.one_hot(mask - first, together, dtype=weights.dtype))[0], overflow
+
+    if together == num_ids:
+        return of_ids(0)
+    credits, overflow = lax.map(of_ids, jnp.arange(0, num_ids, together, dtype=jnp.int32))
+    return credits.transpose(1, 0, 2).reshape(len(splats), -1)[:, :num_ids], overflow[0]
+
+
+def _draw(output: str, splats: Splats, camera: Camera, config: RenderConfig, **options) -> tuple[Array, Array]:
+    """One output of the renderer, and the pairs that it dropped."""
+    frame = render(splats, camera, config, outputs=(output,), **options)
+    return getattr(frame, output), frame.overflow
+
+
+@eqx.filter_jit
+def _elect(votes, background: str, min_votes, purity, break_ties):
+    """Winning id and its share of the votes; `break_ties` turns candidates [n j], -1 for none, into credits [n j]."""
+    objects, none = votes[:, 1:], votes[:, 0]
+    most = jnp.max(objects, 1)
+    winner = jnp.argmax(objects, 1).astype(jnp.int32) + 1
+    floats = jnp.promote_types(votes.dtype, jnp.float32)
+    total = jnp.sum(objects, 1, dtype=floats)
+    if background == "vote":
+        total += none
+        winner = jnp.where(none > most, 0, winner)
+    else:
+        winner = jnp.where(most == 0, 0, winner)
+        total = jnp.where(most == 0, none, total)
+    if break_ties is not None:
+        winner = _settle(votes, most, winner, background, break_ties)
+    seen = (total > 0) & (total + 0.5 >= min_votes)
+    share = jnp.where(winner == 0, none, most) / jnp.where(seen, total, 1.0)
+    object_id = jnp.where(share < purity, 0, winner)
+    return jnp.where(seen, object_id, -1), jnp.where(seen, share, 0.0)
+
+
+def _settle(votes, most, winner, background: str, break_ties):
+    """The winner among ids of equal votes: largest credit, then lowest non-zero id."""
+    ids = jnp.arange(votes.shape[1])
+    competes = (votes == most[:, None]) & (most > 0)[:, None]
+    if background == "ignore":
+        competes &= ids > 0
+    competes &= (winner > 0)[:, None] & (jnp.sum(competes, 1) > 1)[:, None]
+    found_ids = []
+    for _ in range(_TIED_IDS):
+        # the background stands last, so that it loses where credits are equal as well
+        objects = competes[:, 1:]
+        found = jnp.where(jnp.any(objects, 1), jnp.argmax(objects, 1) + 1, jnp.where(competes[:, 0], 0, -1))
+        found_ids.append(found.astype(jnp.int32))
+        competes &= ids != found[:, None]
+    candidates = jnp.stack(found_ids, 1)
+    tied = candidates[:, 0] >= 0
+    nothing = jax.eval_shape(break_ties, candidates)
+    credits = lax.cond(jnp.any(tied), break_ties, lambda _: jnp.zeros(nothing.shape, nothing.dtype), candidates)
+    best = jnp.argmax(jnp.where(candidates >= 0, credits, -1.0), 1)
+    return jnp.where(tied, jnp.take_along_axis(candidates, best[:, None], 1)[:, 0], winner)
+
+
+def _is_known(value) -> bool:
+    return not isinstance(value, jax.core.Tracer)
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise InputError(f"{name} = {value!r}: choose from {', '.join(choices)}.")
+
+
+def _check_masks(cameras: Camera, masks, num_ids: int) -> None:
+    if cameras.world_to_cam.ndim != 3 or len(cameras) == 0:
+        raise InputError("cameras hold no views: pass a batch of at least one camera (see camera.stack_cameras).")
+    if num_ids < 2:
+        raise InputError(f"num_ids = {num_ids}: at least 2 are needed, the background and one object.")
+    expected = len(cameras), cameras.height, cameras.width
+    if masks.shape != expected:
+        raise InputError(f"masks have shape {masks.shape}, the cameras ask for {expected} (views, height, width).")
+    if not jnp.issubdtype(masks.dtype, jnp.integer):
+        raise InputError(f"masks have type {masks.dtype}: integer ids are needed.")
+    if _is_known(masks):
+        low, high = int(np.min(masks)), int(np.max(masks))
+        if low < 0:
+            raise InputError(f"masks hold the id {low}: ids start at 0, the background.")
+        if high >= num_ids:
+            raise InputError(f"masks hold the id {high}, num_ids = {num_ids}: raise num_ids to {high + 1} or relabel.")
