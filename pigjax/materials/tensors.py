@@ -1,0 +1,53 @@
+"""3x3 algebra on component-first arrays `[3, 3, *n]`, the layout of the laws: one machine vector holds many particles."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from pigjax import linalg
+
+Tensors = Float[Array, "3 3 *n"]
+Scalars = Float[Array, "*n"]
+
+
+def identity(like: Tensors) -> Float[Array, "3 3 *_"]:
+    """Identity that broadcasts against `like`."""
+    return jnp.eye(3, dtype=like.dtype).reshape(3, 3, *[1] * (like.ndim - 2))
+
+
+def product(a: Tensors, b: Tensors) -> Tensors:
+    """Matrix product."""
+    return sum(a[:, k, None] * b[k] for k in range(3))
+
+
+def transpose(a: Tensors) -> Tensors:
+    """Matrix transpose."""
+    return jnp.swapaxes(a, 0, 1)
+
+
+def trace(a: Tensors) -> Scalars:
+    """Sum of the diagonal."""
+    return a[0, 0] + a[1, 1] + a[2, 2]
+
+
+def determinant(a: Tensors) -> Scalars:
+    """Triple product of the rows."""
+    (a00, a01, a02), (a10, a11, a12), (a20, a21, a22) = a
+    return a00 * (a11 * a22 - a12 * a21) - a01 * (a10 * a22 - a12 * a20) + a02 * (a10 * a21 - a11 * a20)
+
+
+def deviator(a: Tensors) -> Tensors:
+    """Trace-free part."""
+    return a - trace(a) / 3 * identity(a)
+
+
+def spectral(axes: Tensors, values: Float[Array, "3 *n"], other: Tensors | None = None) -> Tensors:
+    """axes @ diag(values) @ otherᵀ, with `other` the axes themselves unless given."""
+    return product(axes * values, transpose(axes if other is None else other))
+
+
+def svd(F: Tensors) -> tuple[Tensors, Float[Array, "3 *n"], Tensors]:
+    """`linalg.svd` in this layout."""
+    u, s, v = linalg.svd(jnp.moveaxis(F, (0, 1), (-2, -1)))
+    return jnp.moveaxis(u, (-2, -1), (0, 1)), jnp.moveaxis(s, -1, 0), jnp.moveaxis(v, (-2, -1), (0, 1))

@@ -1,0 +1,198 @@
+"""The state of a simulation: particles, the grid around them, and what its health was."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from pigjax.arrays import array_field, static_field
+from pigjax.errors import InputError, SimulationError
+from pigjax.materials import MaterialTable
+
+WALL = 3  # outer nodes on each side of the grid that belong to the wall of the domain
+
+
+class Particles(eqx.Module):
+    """Material points of one simulation (paper 3.1.2), in any order of materials.
+
+    `x` turns NaN for a particle whose state is no longer finite; such a particle takes no further part.
+    """
+
+    x: Float[Array, "p 3"] = array_field()  # position [m]
+    v: Float[Array, "p 3"] = array_field()  # velocity [m/s]
+    F: Float[Array, "p 3 3"] = array_field()  # elastic deformation gradient
+    C: Float[Array, "p 3 3"] = array_field()  # velocity gradient, by APIC [1/s]
+    F_visual: Float[Array, "p 3 3"] = array_field()  # total deformation, stretches bounded, for drawing
+    volume0: Float[Array, "p"] = array_field()  # at rest [m³]
+    mass: Float[Array, "p"] = array_field()  # [kg]
+    material: Int[Array, "p"] = array_field()  # row of the material table
+    hardening: Float[Array, "p"] = array_field()  # internal variable of the plastic laws
+    gaussian: Int[Array, "p"] = array_field()  # index of the Gaussian it carries, -1 for none
+    counts: tuple[int, ...] = static_field()  # particles of each row: what sizes the groups that the laws are traced for
+
+    def __len__(self) -> int:
+        return self.x.shape[0]
+
+
+class Grid(eqx.Module):
+    """A box of nodes. Its outer three nodes on each side are the wall of the domain.
+
+    Raises:
+        InputError: a side is too short to hold anything between its walls.
+    """
+
+    origin: Float[Array, "3"] = array_field()  # first node [m]
+    dx: Float[Array, ""] = array_field()  # [m]
+    shape: tuple[int, int, int] = static_field()
+
+    def __check_init__(self):
+        if min(self.shape) < 2 * WALL + 2:
+            raise InputError(f"Grid.shape = {self.shape}: every side needs {2 * WALL + 2} nodes or more.")
+
+    @property
+    def points(self) -> Float[Array, "nx ny nz 3"]:
+        """Positions of the nodes [m]."""
+        axes = [jnp.arange(n, dtype=self.origin.dtype) for n in self.shape]
+        return self.origin + self.dx * jnp.stack(jnp.meshgrid(*axes, indexing="ij"), -1)
+
+
+class Trajectory(eqx.Module):
+    """What moved, one entry per frame, after the frame."""
+
+    x: Float[Array, "t p 3"]  # [m]
+    v: Float[Array, "t p 3"]  # [m/s]
+    F_visual: Float[Array, "t p 3 3"]
+
+
+class StepHealth(eqx.Module):
+    """What went wrong in a step, as data."""
+
+    min_J: Float[Array, ""]  # smallest determinant of F
+    max_courant: Float[Array, ""]  # longest way of a particle in one step [cells]
+    escaped: Int[Array, ""]  # particles that the domain's wall had to hold back, most at one time
+    nonfinite: Int[Array, ""]  # particles lost to NaN or infinity
+    inverted: Int[Array, ""]  # particles turned inside out, most at one time
+
+    def is_bad(self) -> Bool[Array, ""]:
+        """Whether anything is wrong."""
+        return (self.escaped + self.nonfinite + self.inverted > 0) | (self.max_courant >= 1)
+
+    def problems(self) -> list[str]:
+        """What is wrong, one clause each (host)."""
+        found = [
+            (self.nonfinite, "became NaN or infinite"),
+            (self.inverted, "turned inside out (det F <= 0)"),
+            (self.escaped, "left the grid"),
+        ]
+        clauses = [f"{int(count)} particle{'s' * (count != 1)} {what}" for count, what in found if count > 0]
+        if self.max_courant >= 1:
+            clauses.append(f"a particle moved {float(self.max_courant):.2g} cells in one step")
+        return clauses
+
+    def raise_if_bad(self) -> None:
+        """Raise if anything is wrong (host).
+
+        Raises:
+            SimulationError: naming every problem and the remedy.
+        """
+        if clauses := self.problems():
+            raise SimulationError(f"The simulation broke down: {', '.join(clauses)}{self._where()}; {_REMEDY}.")
+
+    def _where(self) -> str:
+        return ""
+
+
+_REMEDY = "take more substeps (or a lower cfl), a larger grid, or softer or slower matter"
+
+
+class Health(StepHealth):
+    """The worst of all steps of a rollout."""
+
+    substeps: Int[Array, ""]  # taken per frame
+    first_bad_frame: Int[Array, ""]  # the first with any problem, -1 for none
+
+    def _where(self) -> str:
+        return f", first in frame {int(self.first_bad_frame)}"
+
+
+def make_particles(
+    x: Float[Array, "p 3"] | np.ndarray,
+    *,
+    volume: Float[Array, ""] | Float[Array, "p"] | np.ndarray | float,
+    table: MaterialTable,
+    material: Int[Array, "p"] | np.ndarray | int = 0,
+    velocity: Any = 0.0,
+    gaussian: Int[Array, "p"] | np.ndarray | int = -1,
+) -> Particles:
+    """Particles at rest shape, in the order given.
+
+    Args:
+        x: positions [m].
+        volume: rest volume of each particle, or of every one [m³].
+        table: materials.
+        material: row of the table of each particle, or of every one; concrete, since it sizes the groups by law.
+        velocity: [m/s], broadcast against x.
+        gaussian: index of the Gaussian that each carries, -1 for none.
+
+    Raises:
+        InputError: there are no particles, a volume is not > 0, or a row is not in the table.
+    """
+    x = jnp.asarray(x)
+    count = x.shape[0]
+    if count == 0:
+        raise InputError("make_particles got no positions: x must hold one particle or more.")
+    if isinstance(material, jax.core.Tracer):
+        raise InputError("material is traced: which particle follows which law must be known before tracing.")
+    rows = np.broadcast_to(np.asarray(material), (count,))
+    if rows.min() < 0 or rows.max() >= len(table):
+        bad = rows.min() if rows.min() < 0 else rows.max()
+        raise InputError(f"material = {bad}: the table has rows 0 to {len(table) - 1}.")
+    volume = jnp.broadcast_to(jnp.asarray(volume, x.dtype), (count,))
+    if not isinstance(volume, jax.core.Tracer) and not np.all(np.asarray(volume) > 0):
+        raise InputError(f"volume = {np.asarray(volume).min()}: rest volumes must be > 0 m³.")
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=x.dtype), (count, 3, 3))
+    return Particles(
+        x=x,
+        v=jnp.broadcast_to(jnp.asarray(velocity, x.dtype), x.shape),
+        F=eye,
+        C=jnp.zeros_like(eye),
+        F_visual=eye,
+        volume0=volume,
+        mass=volume * table.density[rows].astype(x.dtype),
+        material=jnp.asarray(rows, jnp.int32),
+        hardening=jnp.zeros(count, x.dtype),
+        gaussian=jnp.broadcast_to(jnp.asarray(gaussian, jnp.int32), (count,)),
+        counts=tuple(int(n) for n in np.bincount(rows, minlength=len(table))),
+    )
+
+
+def fit_grid(x: Float[Array, "p 3"] | np.ndarray, dx: float, *, margin: float = 0.0) -> Grid:
+    """Grid around the particles with `margin` [m] of room inside its walls (host).
+
+    Nodes lie on multiples of dx and sides have 2ᵏ or 3·2ᵏ nodes, so that a grid fitted anew to moved matter mostly
+    has the old shape and always the old lattice.
+
+    Raises:
+        InputError: no particle has a finite position, or dx is not > 0.
+    """
+    x = np.asarray(x)
+    finite = x[np.isfinite(x).all(-1)]
+    if not len(finite):
+        raise InputError("fit_grid found no particle with a finite position.")
+    if not dx > 0:
+        raise InputError(f"dx = {dx}: the grid spacing must be > 0 m.")
+    low = np.floor((finite.min(0) - margin) / dx).astype(int) - WALL
+    high = np.ceil((finite.max(0) + margin) / dx).astype(int) + WALL
+    nx, ny, nz = (_round_up_size(int(n)) for n in high - low + 1)
+    low -= (np.array([nx, ny, nz]) - (high - low + 1)) // 2
+    return Grid(jnp.asarray(low * dx, x.dtype), jnp.asarray(dx, x.dtype), (nx, ny, nz))
+
+
+def _round_up_size(nodes: int) -> int:
+    sizes = (size << k for k in range(30) for size in (8, 12))
+    return next(size for size in sizes if size >= nodes)

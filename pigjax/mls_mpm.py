@@ -1,0 +1,530 @@
+"""MLS-MPM (Hu et al. 2018, doi 10.1145/3197517.3201293) with APIC: one explicit step, and whole rollouts.
+
+Particles keep the user's order outside. Inside they are grouped by law, each group padded to whole chunks: a law is
+traced for its own particles only, and a scan over chunks keeps what happens to a particle inside the cache.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from pigjax import linalg
+from pigjax.arrays import static_field
+from pigjax.colliders import Collider, Contact
+from pigjax.errors import InputError
+from pigjax.materials import LAWS, MaterialTable, Parameters, respond
+from pigjax.materials.tensors import determinant, product
+from pigjax.matter import WALL, Grid, Health, Particles, StepHealth, Trajectory
+from pigjax.transfers import KERNELS, gather, scatter, stage, stencil
+
+Vector = Float[Array, "3"] | Sequence[float | int] | np.ndarray
+_WALLS = ("separate", "slip", "sticky")
+_INTEGRATORS = ("explicit",)
+_CACHED = 4096  # particles of a chunk on a CPU: their windows fit its second-level cache
+
+
+class SimConfig(eqx.Module):
+    """Every choice of the simulation that is compiled in.
+
+    Raises:
+        InputError: a choice does not exist.
+    """
+
+    kernel: str = static_field(default="quadratic")  # or "cubic": smoother, 2.4 times as many nodes
+    integrator: str = static_field(default="explicit")
+    substeps: int | None = static_field(default=None)  # per frame; None: the fewest that are stable
+    cfl: float = static_field(default=0.4)  # share of a cell that waves and particles cross in a step
+    walls: str = static_field(default="separate")  # of the domain: "separate", "slip" or "sticky"
+    visual_stretch: tuple[float, float] = static_field(default=(0.2, 5.0))  # bounds of F_visual's singular values
+    chunk: int | None = static_field(default=None)  # particles handled at once; None: 4096 on a CPU, else all
+    force: bool = static_field(default=False)  # run steps longer than the stable limit
+
+    def __check_init__(self):
+        for name, value, choices in (
+            ("kernel", self.kernel, KERNELS),
+            ("integrator", self.integrator, _INTEGRATORS),
+            ("walls", self.walls, _WALLS),
+        ):
+            if value not in choices:
+                raise InputError(f"SimConfig.{name} = {value!r}: choose one of {', '.join(choices)}.")
+        if self.substeps is not None and self.substeps < 1:
+            raise InputError(f"SimConfig.substeps = {self.substeps}: must be 1 or more.")
+        if not self.cfl > 0:
+            raise InputError(f"SimConfig.cfl = {self.cfl}: must be > 0.")
+
+
+def stable_dt(
+    table: MaterialTable, grid: Grid, *, max_speed: Float[Array, ""] | float, cfl: float = 0.4
+) -> Float[Array, ""]:
+    """Longest explicit step [s]: no wave of the stiffest law, on matter that moves at max_speed [m/s], crosses more than
+    `cfl` cells, and no viscous momentum diffuses farther than the grid resolves."""
+    advective = grid.dx / (table.wave_speed.max() + max_speed)
+    viscous = grid.dx**2 / (4 * (table.viscosity / table.density).max())  # infinite without viscosity
+    return cfl * jnp.minimum(advective, viscous)
+
+
+def choose_substeps(
+    particles: Particles,
+    grid: Grid,
+    table: MaterialTable,
+    config: SimConfig,
+    *,
+    frames: int,
+    frame_dt: float,
+    gravity: Vector,
+    colliders: tuple[Collider, ...] = (),
+) -> int:
+    """Substeps per frame that keep a rollout stable (host).
+
+    The speed that falling can reach, by time or by the size of the grid, counts beside the present one. The number is
+    rounded up by at most an eighth, so that similar scenes share one compilation.
+    """
+    fall = float(np.linalg.norm(gravity))
+    height = float(grid.dx) * math.hypot(*grid.shape)
+    speed = _max_speed(particles, colliders)
+    speed = min(speed + fall * frames * frame_dt, math.sqrt(speed**2 + 2 * fall * height))
+    needed = math.ceil(float(frame_dt) / float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl)) * (1 - 1e-6))
+    unit = 2 ** max(needed.bit_length() - 4, 0)
+    return max(-(-needed // unit) * unit, 1)
+
+
+def step(
+    particles: Particles,
+    grid: Grid,
+    table: MaterialTable,
+    config: SimConfig,
+    dt: Float[Array, ""] | float,
+    *,
+    gravity: Vector,
+    colliders: tuple[Collider, ...] = (),
+) -> tuple[Particles, StepHealth]:
+    """One explicit step of dt [s] under gravity [m/s²]: particles to grid, grid update, grid to particles.
+
+    Raises:
+        InputError: dt is above `stable_dt` (seen outside of jit only, and unless `config.force`).
+    """
+    _check_table(particles, table)
+    if not _is_traced(particles, grid, table, dt, gravity, colliders):
+        _check_dt(float(dt), particles, grid, table, config, colliders)
+    return _step(particles, grid, table, config, _like(dt, particles), _like(gravity, particles), colliders)
+
+
+def rollout(
+    particles: Particles,
+    grid: Grid,
+    table: MaterialTable,
+    config: SimConfig,
+    *,
+    frames: int,
+    frame_dt: Float[Array, ""] | float,
+    gravity: Vector,
+    colliders: tuple[Collider, ...] = (),
+) -> tuple[Particles, Trajectory, Health]:
+    """Simulate `frames` frames of frame_dt [s] each under gravity [m/s²].
+
+    Reverse mode holds one state of the particles per block of about √(frames · substeps) steps and recomputes within.
+
+    Raises:
+        InputError: config.substeps is None inside jit, grad or vmap, or its step is above `stable_dt` (seen outside of
+            those only, and unless `config.force`).
+    """
+    _check_table(particles, table)
+    substeps = config.substeps
+    if not _is_traced(particles, grid, table, frame_dt, gravity, colliders):
+        if substeps is None:
+            substeps = choose_substeps(
+                particles, grid, table, config, frames=frames, frame_dt=frame_dt, gravity=gravity, colliders=colliders
+            )
+        _check_dt(float(frame_dt) / substeps, particles, grid, table, config, colliders)
+    elif substeps is None:
+        raise InputError(
+            "rollout is traced by jit, grad or vmap and cannot choose its substeps: give SimConfig(substeps=...);"
+            " choose_substeps finds the number from concrete values."
+        )
+    dt = _like(frame_dt, particles) / substeps
+    return _rollout(particles, grid, table, config, dt, _like(gravity, particles), colliders, frames, substeps)
+
+
+class _State(NamedTuple):
+    """What changes of the particles of one law; the leading axes are chunk and particle."""
+
+    x: Array
+    v: Array
+    C: Array
+    F: Array
+    stress: Array  # Kirchhoff, of F [Pa]: the return map that finds F finds it too
+    hardening: Array
+    F_visual: Array | None  # None where F is the total deformation
+
+
+class _Group(NamedTuple):
+    """What does not change of the particles of one law."""
+
+    law: str
+    mass: Array
+    volume0: Array  # 0 for particles that only fill the last chunk
+    parameters: Parameters  # one row for all, or one for each particle
+
+
+class _Scene(NamedTuple):
+    """What all steps of a simulation share."""
+
+    groups: tuple[_Group, ...]
+    grid: Grid
+    config: SimConfig
+    dt: Array
+    gravity: Array
+    colliders: tuple[Collider, ...]
+    contacts: tuple[Contact | None, ...]  # of the colliders that do not move
+    frozen: Array | None  # nodes that stationary matter touches
+    unit_mass: Array  # of the heaviest particle [kg]
+    go: Array  # for `stage`
+
+
+@eqx.filter_jit
+def _step(particles, grid, table, config, dt, gravity, colliders):
+    scene, states, restore = _prepare(particles, grid, table, config, dt, gravity, colliders)
+    states, health = _advance(scene, states, 0.0)
+    return restore(_bound_visual(scene, states)), health
+
+
+@eqx.filter_jit
+def _rollout(particles, grid, table, config, dt, gravity, colliders, frames, substeps):
+    scene, states, restore = _prepare(particles, grid, table, config, dt, gravity, colliders)
+    block = _block_length(substeps, frames)
+
+    def substep(carry, _):
+        states, worst, steps = carry
+        states, health = _advance(scene, states, steps * dt)
+        return (states, _worse(worst, health), steps + 1), None
+
+    @partial(jax.checkpoint, prevent_cse=False)
+    def steps_of_block(carry, _):
+        return lax.scan(substep, carry, None, length=block)
+
+    def frame(carry, _):
+        states, worst, steps = carry
+        (states, health, steps), _ = lax.scan(
+            steps_of_block, (states, _healthy(dt), steps), None, length=substeps // block
+        )
+        states = _bound_visual(scene, states)
+        moved = restore(states)
+        return (states, _worse(worst, health), steps), (moved.x, moved.v, moved.F_visual, health.is_bad())
+
+    start = (states, _healthy(dt), jnp.zeros((), int))
+    (states, worst, _), (*moved, bad) = lax.scan(frame, start, None, length=frames)
+    first_bad = jnp.where(bad.any(), jnp.argmax(bad), -1)
+    health = Health(**vars(worst), substeps=jnp.asarray(substeps), first_bad_frame=first_bad)
+    return restore(states), Trajectory(*moved), health
+
+
+def _advance(scene, states, time):
+    """One step of all groups."""
+    nodes = jnp.zeros((*scene.grid.shape, 4), scene.dt.dtype)
+    for group, state in zip(scene.groups, states):
+        nodes = _particles_to_grid(scene, group, state, nodes)
+    velocity = jax.checkpoint(partial(_update_grid, scene), prevent_cse=False)(nodes, time)
+    health, moved = _healthy(scene.dt), []
+    for group, state in zip(scene.groups, states):
+        state, own = _grid_to_particles(scene, group, state, velocity)
+        health = _worse(health, own)
+        moved.append(state)
+    return tuple(moved), health
+
+
+def _particles_to_grid(scene, group, state, nodes):
+    """Mass and momentum of the nodes, stress included."""
+    kernel, dx = KERNELS[scene.config.kernel], scene.grid.dx
+
+    def chunk(nodes, particles):
+        state, mass, volume = particles
+        ok, state = _only_finite(state)
+        mass, volume = jnp.where(ok, mass, 0.0), jnp.where(ok, volume, 0.0)
+        at = stage(scene.go, partial(stencil, kernel=kernel, shape=scene.grid.shape), _cells(scene.grid, state.x))
+        force = (-scene.dt * kernel.inverse_inertia / dx) * volume * _tensors(state.stress)
+        affine = dx * mass * _tensors(state.C) + force
+        return scatter(nodes, at, mass, mass * state.v.T, affine, kernel, scene.go), None
+
+    state = state._replace(hardening=None, F_visual=None, F=None)
+    return _scan_chunks(chunk, nodes, (state, group.mass, group.volume0))[0]
+
+
+def _update_grid(scene, nodes, time):
+    """Velocities of the nodes after gravity, colliders, stationary matter and walls."""
+    mass = nodes[..., :1] / scene.unit_mass
+    # Below this a node's mass squared, by which derivatives divide, leaves the range of floating point.
+    filled = mass > jnp.finfo(mass.dtype).tiny ** 0.5
+    velocity = nodes[..., 1:] / scene.unit_mass / jnp.where(filled, mass, 1.0) + scene.dt * scene.gravity
+    velocity = jnp.where(filled, velocity, 0.0)
+    for collider, contact in zip(scene.colliders, scene.contacts):
+        velocity = collider.apply(contact or collider.contact(scene.grid.points, time), velocity)
+    if scene.frozen is not None:
+        velocity = jnp.where(scene.frozen[..., None], 0.0, velocity)
+    return _apply_walls(velocity, scene.config.walls)
+
+
+def _apply_walls(velocity, mode):
+    components = [velocity[..., k] for k in range(3)]
+    for axis, nodes in enumerate(velocity.shape[:3]):
+        index = np.arange(nodes).reshape([-1 if k == axis else 1 for k in range(3)])
+        low, high = index < WALL, index >= nodes - WALL
+        if mode == "sticky":
+            components = [jnp.where(low | high, 0.0, v) for v in components]
+        elif mode == "slip":
+            components[axis] = jnp.where(low | high, 0.0, components[axis])
+        else:
+            v = components[axis]
+            components[axis] = jnp.where(low, jnp.maximum(v, 0.0), jnp.where(high, jnp.minimum(v, 0.0), v))
+    return jnp.stack(components, -1)
+
+
+def _grid_to_particles(scene, group, state, velocity):
+    """Move the particles with the grid, and let their matter respond."""
+    kernel, dx, dt = KERNELS[scene.config.kernel], scene.grid.dx, scene.dt
+    one_row = group.parameters.density.ndim == 0
+
+    def chunk(velocity, particles):
+        old, volume, rows = particles
+        ok, state = _only_finite(old)
+        at = stage(scene.go, partial(stencil, kernel=kernel, shape=scene.grid.shape), _cells(scene.grid, state.x))
+        v, per_cell = gather(velocity, at, kernel, scene.go)
+        rate = per_cell / dx
+        parameters = group.parameters if one_row else rows
+        matter = respond(group.law, _tensors(state.F), rate, dt, state.hardening, parameters)
+        x = state.x.T + dt * v
+        held = _hold_inside(scene.grid, x)
+        visual = None
+        if state.F_visual is not None:
+            visual = _tensors(state.F_visual)
+            visual = _rows(visual + dt * product(rate, visual))
+        new = _State(held.T, v.T, _rows(rate), _rows(matter.F), _rows(matter.stress), matter.hardening, visual)
+        new = _mark_nonfinite(_select(ok, new, old))
+        alive, J = ok & (volume > 0), determinant(matter.F)
+        health = StepHealth(
+            min_J=jnp.where(alive, J, jnp.inf).min(),
+            max_courant=jnp.sqrt(jnp.where(alive, (v * v).sum(0), 0.0).max()) * dt / dx,
+            escaped=(alive & (x != held).any(0)).sum(),
+            nonfinite=((volume > 0) & ~jnp.isfinite(new.x[:, 0])).sum(),
+            inverted=(alive & (J <= 0)).sum(),
+        )
+        return velocity, (new, jax.tree.map(lax.stop_gradient, health))
+
+    _, (state, health) = _scan_chunks(chunk, velocity, (state, group.volume0, None if one_row else group.parameters))
+    least, most, *counts = jax.tree.leaves(health)
+    return state, StepHealth(least.min(), most.max(), *(count.sum() for count in counts))
+
+
+def _scan_chunks(chunk, carry, particles):
+    return lax.scan(jax.checkpoint(chunk, prevent_cse=False), carry, particles)
+
+
+def _cells(grid, x):
+    """Positions in cells from the first node [3 c], off the outermost layer of cells."""
+    last = jnp.asarray(grid.shape, x.dtype) - 2
+    return jnp.clip((x - grid.origin) / grid.dx, 1, last).T
+
+
+def _hold_inside(grid, x):
+    """Positions [3 c] off the outermost layer of cells, where a window would reach over the edge."""
+    last = jnp.asarray(grid.shape, x.dtype) - 2
+    return jnp.clip(x, (grid.origin + grid.dx)[:, None], (grid.origin + last * grid.dx)[:, None])
+
+
+def _tensors(rows):
+    return jnp.transpose(rows, (1, 2, 0))
+
+
+def _rows(tensors):
+    return jnp.transpose(tensors, (2, 0, 1))
+
+
+def _select(ok, new, old):
+    return jax.tree.map(lambda n, o: jnp.where(ok.reshape(-1, *[1] * (n.ndim - 1)), n, o), new, old)
+
+
+def _only_finite(state):
+    """Which particles are still finite, and a state without the others, whose derivative is zero."""
+    ok = jnp.isfinite(state.x).all(-1)
+    rest = jax.tree.map(jnp.zeros_like, state)
+    if state.F is not None:
+        rest = rest._replace(F=jnp.broadcast_to(jnp.eye(3, dtype=state.F.dtype), state.F.shape))
+    return ok, _select(ok, state, rest)
+
+
+def _mark_nonfinite(state):
+    """Position NaN where anything of a particle is not finite."""
+    axis = state.hardening.ndim
+    total = sum(leaf.sum(range(axis, leaf.ndim)) for leaf in jax.tree.leaves(state))
+    return state._replace(x=jnp.where(jnp.isfinite(total)[..., None], state.x, jnp.nan))
+
+
+def _bound_visual(scene, states):
+    """Hold the stretches of F_visual in bounds: flow without end would otherwise draw needles."""
+    low, high = scene.config.visual_stretch
+
+    def bound(state):
+        if state.F_visual is None:
+            return state
+        u, s, v = linalg.svd(state.F_visual)
+        s = jnp.clip(s, low, high)
+        return state._replace(F_visual=linalg.matmul3(u * s[..., None, :], linalg.transpose(v)))
+
+    return tuple(bound(state) for state in states)
+
+
+def _prepare(particles, grid, table, config, dt, gravity, colliders):
+    """Scene, states by law, and the function that puts states back into the user's order."""
+    rows_of = {law: [row for row, l in enumerate(table.laws) if l == law] for law in table.laws}
+    sizes = {law: sum(particles.counts[row] for row in rows) for law, rows in rows_of.items()}
+    laws = [law for law, size in sizes.items() if size]
+    order = None
+    if len(laws) > 1:
+        rank = jnp.asarray([laws.index(law) if law in laws else -1 for law in table.laws])
+        order = jnp.argsort(rank[particles.material], stable=True)
+
+    ends = np.cumsum([sizes[law] for law in laws])
+    sorted_particles = particles if order is None else _reorder(particles, order)
+    parts = [
+        jax.tree.map(lambda a: a[end - sizes[law] : end], sorted_particles) for law, end in zip(laws, ends)
+    ]
+    groups, states, frozen = [], [], None
+    for law, part in zip(laws, parts):
+        if LAWS[law].respond is None:
+            frozen = _touched_nodes(grid, part.x, KERNELS[config.kernel])
+        else:
+            group, state = _group(law, part, rows_of[law], table, config, dt)
+            groups.append(group)
+            states.append(state)
+
+    def restore(states):
+        remaining = iter(states)
+        moved = [
+            part if LAWS[law].respond is None else _ungroup(part, next(remaining)) for law, part in zip(laws, parts)
+        ]
+        merged = jax.tree.map(lambda *pieces: jnp.concatenate(pieces), *moved)
+        return merged if order is None else _reorder(merged, jnp.argsort(order))
+
+    points = grid.points
+    scene = _Scene(
+        groups=tuple(groups),
+        grid=grid,
+        config=config,
+        dt=dt,
+        gravity=gravity,
+        colliders=colliders,
+        contacts=tuple(c.contact(points) if c.velocity is None else None for c in colliders),
+        frozen=frozen,
+        unit_mass=lax.stop_gradient(particles.mass.max()),
+        go=particles.volume0[0] > 0,
+    )
+    return scene, tuple(states), restore
+
+
+def _group(law, part, rows, table, config, dt):
+    """Particles of one law in whole chunks, the last particle repeated without mass, with their present stress."""
+    count = len(part)
+    limit = config.chunk or (_CACHED if jax.default_backend() == "cpu" else count)
+    chunks = -(-count // limit)
+    size = -(-count // chunks)
+
+    def chunked(array):
+        padding = [(0, chunks * size - count)] + [(0, 0)] * (array.ndim - 1)
+        return jnp.pad(array, padding, mode="edge").reshape(chunks, size, *array.shape[1:])
+
+    real = (np.arange(chunks * size) < count).reshape(chunks, size)
+    if len(rows) == 1:
+        parameters = table.rows(rows[0])
+    else:
+        parameters = jax.tree.map(chunked, table.rows(part.material))
+    visual = None if LAWS[law].total else part.F_visual
+    state = _State(part.x, part.v, part.C, part.F, jnp.zeros_like(part.F), part.hardening, visual)
+    state = _mark_nonfinite(jax.tree.map(chunked, state))
+
+    F, rate = (jnp.moveaxis(a, (-2, -1), (0, 1)) for a in (state.F, state.C))
+    matter = respond(law, F, rate, jnp.zeros_like(dt), state.hardening, parameters)
+    F, stress = (jnp.moveaxis(a, (0, 1), (-2, -1)) for a in (matter.F, matter.stress))
+    state = _mark_nonfinite(state._replace(F=F, stress=stress, hardening=matter.hardening))
+    mass, volume = (jnp.where(real, chunked(a), 0.0) for a in (part.mass, part.volume0))
+    return _Group(law, mass, volume, parameters), state
+
+
+def _ungroup(part, state):
+    """Particles with the state that their group has reached."""
+
+    def flat(array):
+        return array.reshape(-1, *array.shape[2:])[: len(part)]
+
+    x, v, C, F, _, hardening, visual = (None if leaf is None else flat(leaf) for leaf in state)
+    return Particles(
+        x, v, F, C, F if visual is None else visual, part.volume0, part.mass, part.material, hardening, part.gaussian,
+        part.counts,
+    )
+
+
+def _reorder(particles, order):
+    return jax.tree.map(lambda a: a[order], particles)
+
+
+def _touched_nodes(grid, x, kernel):
+    """Nodes in the windows of particles [p 3]."""
+    first = stencil(_cells(grid, x), kernel, grid.shape).first
+    offsets = np.stack(np.meshgrid(*[np.arange(len(kernel.offsets))] * 3, indexing="ij"), -1).reshape(-1, 3)
+    i, j, k = jnp.moveaxis(first[:, None] + offsets, -1, 0)
+    return jnp.zeros(grid.shape, bool).at[i, j, k].set(True)
+
+
+def _healthy(dt):
+    none = jnp.zeros((), int)
+    return StepHealth(jnp.full((), jnp.inf, dt.dtype), jnp.zeros((), dt.dtype), none, none, none)
+
+
+def _worse(a, b):
+    merged = jax.tree.map(jnp.maximum, a, b)
+    return eqx.tree_at(lambda health: health.min_J, merged, jnp.minimum(a.min_J, b.min_J))
+
+
+def _block_length(substeps, frames):
+    """Largest divisor of the substeps of a frame that is not above the root of all substeps."""
+    most = math.isqrt(frames * substeps)
+    return next(n for n in range(min(substeps, most), 0, -1) if substeps % n == 0)
+
+
+def _like(value, particles):
+    return jnp.asarray(value, particles.x.dtype)
+
+
+def _is_traced(*trees: Any) -> bool:
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def _max_speed(particles, colliders):
+    speeds = np.linalg.norm(np.asarray(particles.v), axis=-1)
+    own = [float(np.linalg.norm(c.velocity)) for c in colliders if c.velocity is not None]
+    return max([float(np.max(speeds, where=np.isfinite(speeds), initial=0.0)), *own])
+
+
+def _check_table(particles, table):
+    if len(particles.counts) != len(table):
+        raise InputError(
+            f"The material table has {len(table)} rows, the particles were made for one of {len(particles.counts)}."
+        )
+
+
+def _check_dt(dt, particles, grid, table, config, colliders):
+    speed = _max_speed(particles, colliders)
+    limit = float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl))
+    if dt > limit * (1 + 1e-5) and not config.force:
+        raise InputError(
+            f"dt = {dt:.4g} s is above the stable limit of {limit:.4g} s at cfl {config.cfl:g} and {speed:.3g} m/s:"
+            " take more substeps, or set SimConfig(force=True)."
+        )
