@@ -13,7 +13,8 @@ from pigjax.errors import InputError
 from pigjax.io.files import PathLike, existing, writing
 
 Background = float | int | tuple[float, float, float]
-Picture = Float[Array | np.ndarray, "h w *rgb"] | UInt8[Array | np.ndarray, "h w *rgb"]
+# [h w 3] or [h w]; sizes have no names, so that a bad frame meets our own message rather than a type checker's.
+Picture = Float[Array | np.ndarray, "_ _ ..."] | UInt8[Array | np.ndarray, "_ _ ..."]
 
 
 def read_image(path: PathLike, *, background: Background = 0.0) -> Float[np.ndarray, "h w 3"]:
@@ -73,7 +74,7 @@ def write_image(path: PathLike, image: Picture) -> None:
             raise InputError(f"{path}: {error}; use a suffix such as .png or .jpg.") from None
 
 
-def contact_sheet(frames: Iterable[Picture], columns: int = 4, *, gap: int = 4) -> UInt8[np.ndarray, "height width 3"]:
+def contact_sheet(frames: Iterable[Picture], columns: int = 4, *, gap: int = 4) -> UInt8[np.ndarray, "h w 3"]:
     """Frames of one size side by side in rows of `columns`, on white, `gap` pixels apart.
 
     Raises:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 
@@ -65,14 +66,9 @@ def _write_mp4(path: Path, first: np.ndarray, rest: Iterator[np.ndarray], fps: f
     # Not imageio's own writer: that forks, of which JAX warns, and leaves ffmpeg running where a frame fails.
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
         assert ffmpeg.stdin is not None
-        try:
+        with suppress(BrokenPipeError):  # ffmpeg gave up, and says why below
             for frame in chain([first], rest):
                 ffmpeg.stdin.write(np.pad(frame, even, mode="edge").tobytes())
-        except BrokenPipeError:
-            pass  # ffmpeg gave up and says why
-        except BaseException:
-            ffmpeg.kill()
-            raise
         _, complaint = ffmpeg.communicate()
     if ffmpeg.returncode:
         raise OSError(f"ffmpeg: {complaint.decode(errors='replace').strip()}")
