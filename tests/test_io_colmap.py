@@ -193,7 +193,7 @@ def test_missing_part_is_named(tmp_path, kind):
 
 def test_missing_photos_are_named_but_cameras_load(tmp_path, kind):
     WRITERS[kind](tmp_path / "sparse" / "0")
-    with pytest.raises(MissingFileError, match=r"a\.png: no such image"):
+    with pytest.raises(MissingFileError, match=r"a\.png: no such photo, which .*names.*images="):
         load_views(tmp_path)
     cameras, names = load_cameras(tmp_path)
     assert len(cameras) == 2

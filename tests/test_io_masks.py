@@ -100,7 +100,7 @@ def test_merging_replaces_all_at_once(tmp_path):
 
 def test_missing_mask_is_named_or_empty(tmp_path):
     np.save(tmp_path / "v.npy", IDS)
-    with pytest.raises(MissingFileError, match=r"no mask for view 'w' \(w\.png or w\.npy\).*missing='empty'"):
+    with pytest.raises(MissingFileError, match=r"no mask for view 'w' \(w\.png or w\.npy\).*be 'empty'"):
         load_masks(tmp_path, ("v", "w"), SIZE)
     masks = load_masks(tmp_path, ("v", "w"), SIZE, missing="empty")
     np.testing.assert_array_equal(masks, [IDS, 0 * IDS])

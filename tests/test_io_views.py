@@ -100,6 +100,7 @@ def test_blender_files_name_the_splits_and_leave_out_suffixes(tmp_path):
     views = load_views(tmp_path)
     assert views.splits == ("train", "test")
     assert views.names == ("train/r_0", "test/r_0")
+    assert load_views(tmp_path, split="test").names == ("test/r_0",)
 
 
 def test_splits_from_file_lists(tmp_path):
@@ -237,7 +238,7 @@ def test_bundled_scene_projects_onto_its_own_colours():
         ({"w": "wide"}, {}, r"transforms\.json: .*\$\.w"),
         ({}, {"w": 41}, r"001\.png is 41x30 but 000\.png is 40x30.*max_size"),
         ({"w": 80, "h": 60}, {}, r"000\.png: image is 40x30 but its camera .*frames\[0\]\) says 80x60.*max_size"),
-        ({}, {"file_path": "images/7.png"}, r"7\.png: no such image"),
+        ({}, {"file_path": "images/7.png"}, r"7\.png: no such photo, which .*frames\[1\] names.*images="),
     ],
 )
 def test_bad_transforms_are_named(tmp_path, shared, frame, message):

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from PIL import Image
 
 from pigjax.camera import Camera
-from pigjax.errors import InputError
+from pigjax.errors import InputError, MissingFileError
 from pigjax.io.capture import Capture, Shot
 from pigjax.io.colmap import find_model, read_model
 from pigjax.io.files import PathLike, existing, existing_folder, read_json
@@ -102,7 +102,8 @@ def load_views(
     _check_one_size(shots, sizes)
     with ThreadPoolExecutor() as pool:
         pictures = list(pool.map(lambda shot, size: _picture(shot, size, background), shots, sizes))
-    names = _names([shot.image for shot in shots])
+    all_names = _names([shot.image for shot in capture.shots])
+    names = tuple(all_names[i] for i in chosen)
     home = capture.root if images is None else Path(images).parent
     folder = home / "object_mask" if masks is True else masks
     return Views(
@@ -200,6 +201,10 @@ def _check_one_size(shots: Sequence[Shot], sizes: Sequence[tuple[int, int]]) -> 
 
 
 def _picture(shot: Shot, size: tuple[int, int], background: Background) -> Float[np.ndarray, "h w 3"]:
+    if not shot.image.is_file():
+        raise MissingFileError(
+            f"{shot.image}: no such photo, which {shot.where} names; put it there, or give their folder as images=."
+        )
     picture = open_rgb(shot.image, background=background)
     if picture.size != shot.size:
         raise InputError(

@@ -152,7 +152,7 @@ def _columns(path: PathLike, vertex: np.ndarray, names: list[str]) -> Float[np.n
     missing = [name for name in names if name not in present]
     if missing:
         raise InputError(
-            f"{path}: property '{missing[0]}' is missing (the file has {', '.join(present)}); export it again with it."
+            f"{path}: property '{missing[0]}' is missing (the file has {', '.join(present)}); export it with that."
         )
     values = np.empty((len(vertex), len(names)), np.float32)
     for column, name in zip(values.T, names):
