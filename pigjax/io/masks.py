@@ -54,7 +54,7 @@ def load_masks(
             mask[:] = _nearest(ids, size, path)
         elif missing == "error":
             raise MissingFileError(
-                f"{folder}: no mask for view '{name}' ({name}.png or {name}.npy); add it or let missing ones be 'empty'."
+                f"{folder}: no mask for view '{name}' ({name}.png or {name}.npy); add it, or let it be 'empty'."
             )
     if resized:
         warnings.warn(
