@@ -1,10 +1,15 @@
 """Field helpers shared by the pytrees: static fields, and conversion of plain numbers. Leaf."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
+
+Vector: TypeAlias = Float[Array, "3"] | Float[np.ndarray, "3"] | Sequence[float]
+Scalar: TypeAlias = Float[Array, ""] | float
 
 
 def as_array(value: Any) -> Any:

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pigjax.arrays import array_field, static_field
+from pigjax.arrays import Vector, array_field, static_field
 
 
 class Camera(eqx.Module):
@@ -50,23 +50,24 @@ class Camera(eqx.Module):
 
 
 def look_at(
-    eye: Float[Array, "3"],
-    target: Float[Array, "3"],
+    eye: Vector,
+    target: Vector,
     *,
-    up: Float[Array, "3"] | tuple[float, float, float] = (0.0, 0.0, 1.0),
+    up: Vector = (0.0, 0.0, 1.0),
     focal: float,
     width: int,
     height: int,
 ) -> Camera:
     """Camera at `eye` [m] that looks at `target` [m] with `up` on top and the principal point in the middle."""
-    eye, target, up = (jnp.asarray(v, jnp.result_type(float)) for v in (eye, target, up))
-    forward = (target - eye) / jnp.linalg.norm(target - eye)
-    right = jnp.cross(forward, up)
+    position, goal, above = (jnp.asarray(v, jnp.result_type(float)) for v in (eye, target, up))
+    forward = (goal - position) / jnp.linalg.norm(goal - position)
+    right = jnp.cross(forward, above)
     right = right / jnp.linalg.norm(right)
     rotation = jnp.stack([right, jnp.cross(forward, right), forward])
-    world_to_cam = jnp.eye(4, dtype=eye.dtype).at[:3, :3].set(rotation).at[:3, 3].set(-rotation @ eye)
-    size = jnp.asarray([width, height], eye.dtype)
-    return Camera(world_to_cam, jnp.full(2, focal, eye.dtype), size / 2, width, height)
+    dtype = position.dtype
+    world_to_cam = jnp.eye(4, dtype=dtype).at[:3, :3].set(rotation).at[:3, 3].set(-rotation @ position)
+    size = jnp.asarray([width, height], dtype)
+    return Camera(world_to_cam, jnp.full(2, focal, dtype), size / 2, width, height)
 
 
 def to_camera(points: Float[Array, "*n 3"], camera: Camera) -> Float[Array, "*n 3"]:
@@ -93,7 +94,7 @@ def unproject(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "h w 3
 
 
 def orbit(
-    target: Float[Array, "3"] | tuple[float, float, float],
+    target: Vector,
     *,
     radius: float,
     elevation: float,

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from pigjax.arrays import array_field, static_field
 from pigjax.camera import Camera, stack_cameras, to_camera
 from pigjax.errors import InputError
-from pigjax.linalg import quat_to_matrix, safe_normalize, safe_sqrt
+from pigjax.linalg import quat_to_matrix, safe_normalize
 from pigjax.tiles import BlendConfig, Projected, blend, tile_boxes, tile_lists
 
 
@@ -121,7 +121,16 @@ def render(
         raise InputError(f"outputs = {tuple(outputs)}: choose from {', '.join(OUTPUTS)}.")
     if "object_weights" in outputs and object_weights is None:
         raise InputError("outputs has 'object_weights': pass object_weights, the membership [n m] of each splat.")
+    tau_T, background = jnp.asarray(tau_T), jnp.asarray(background)
+    return _render(gaussians_or_splats, camera, config, background, tuple(outputs), object_weights, tau_T)
+
+
+@eqx.filter_jit
+def _render(gaussians_or_splats, camera, config, background, outputs, object_weights, tau_T) -> Frame:
     splats = as_splats(gaussians_or_splats)
+    if len(splats) == 0:
+        # gathers need a row: one splat of opacity 0 draws nothing
+        splats, object_weights = jax.tree.map(lambda v: jnp.zeros((1, *v.shape[1:]), v.dtype), (splats, object_weights))
     features = []
     if "rgb" in outputs:
         features.append(colours(splats, camera, config.sh_degree))
@@ -260,7 +269,8 @@ def project_splats(splats: Splats, camera: Camera, config: RenderConfig) -> Proj
     if config.antialias:
         bare = jnp.maximum(a * c - b * b, 0.0)
         a, c = a + config.dilation, c + config.dilation
-        opacities = opacities * safe_sqrt(bare / (a * c - b * b))
+        flat = bare <= 0  # a needle seen end on: the root's slope is infinite there
+        opacities = opacities * jnp.where(flat, 0.0, jnp.sqrt(jnp.where(flat, 1.0, bare) / (a * c - b * b)))
     else:
         a, c = a + config.dilation, c + config.dilation
     # a needle's a·c and b·b cancel in float32; the dilated determinant is at least dilation²

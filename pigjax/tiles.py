@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.arrays import static_field
 
+_KEY_LIMIT = 2**31  # tile and depth rank share one int32 sort key below it
 _SHAPE_COLUMNS = 6  # table of the blending loop: x, y, conic xx xy yy, opacity, then the features
 
 
@@ -96,7 +97,7 @@ def tile_lists(projected: Projected, config: BlendConfig, capacity: int) -> Tile
     kept = (slots < total) & (reach >= config.alpha_min * 0.999)
 
     tile_index = jnp.where(kept, tile_y * config.columns + tile_x, config.tiles)
-    if (config.tiles + 1) * count < 2**31:
+    if (config.tiles + 1) * count < _KEY_LIMIT:
         key = lax.sort(tile_index * count + rank, is_stable=False)
         tile_index, rank = key // max(count, 1), key % max(count, 1)
     else:
@@ -220,7 +221,7 @@ def _forward(table, lists: TileLists, tau, config: BlendConfig):
 
         def blend_chunk(state):
             position, transmittance, total = state
-            rows = lax.dynamic_slice(rows_in_order, (position, 0), (config.chunk, width))
+            rows = lax.dynamic_slice_in_dim(rows_in_order, position, config.chunk)
             alpha, _ = _alphas(rows, x, y, position + offsets < end, config)
 
             def one(before, alpha):
@@ -271,7 +272,7 @@ def _composite_bwd(config: BlendConfig, saved, cotangent):
 
         def walk_chunk(state):
             position, transmittance, prefix, gradients = state
-            rows = lax.dynamic_slice(rows_in_order, (position, 0), (config.chunk, width))
+            rows = lax.dynamic_slice_in_dim(rows_in_order, position, config.chunk)
             alpha, free = _alphas(rows, x, y, position + offsets < end, config)
             gain = rows[:, _SHAPE_COLUMNS : _SHAPE_COLUMNS + blended] @ towards[:blended]
 
@@ -288,7 +289,7 @@ def _composite_bwd(config: BlendConfig, saved, cotangent):
             towards_power = jnp.where(free, -slope * alpha, 0.0)
             columns = [towards_power @ monomials, weight @ towards[:blended].T]
             columns += [p.astype(dtype) @ towards[blended:].T for p in picked]
-            gradients = lax.dynamic_update_slice(gradients, jnp.concatenate(columns, 1), (position, 0))
+            gradients = lax.dynamic_update_slice_in_dim(gradients, jnp.concatenate(columns, 1), position, 0)
             return position + config.chunk, transmittance, prefix, gradients
 
         state = lists.start[tile], jnp.ones(pixels, dtype), jnp.zeros(pixels, dtype), gradients

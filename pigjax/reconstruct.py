@@ -1,0 +1,287 @@
+"""Fitting Gaussians to photos: L1 + D-SSIM, Adam groups as 3DGS, relocation at a constant number of splats."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import lax
+from jaxtyping import Array, Float, Int
+from scipy.spatial import cKDTree
+
+from pigjax import io
+from pigjax.arrays import static_field
+from pigjax.camera import Camera
+from pigjax.errors import InputError
+from pigjax.metrics import psnr, ssim
+from pigjax.relocation import relocate, shake
+from pigjax.splat import Gaussians, RenderConfig, render, required_capacity
+
+_DC = 0.28209479177387814
+
+
+class FitConfig(eqx.Module):
+    """Settings of a reconstruction, all static. Learning rates are those of Adam, per step."""
+
+    steps: int = static_field(default=3000)
+    splats: int = static_field(default=15_000)
+    sh_degree: int = static_field(default=1)
+    ssim_weight: float = static_field(default=0.2)  # 0 traces no SSIM
+    background: float = static_field(default=0.0)  # grey level behind the splats, as in the photos
+    means_rate: float = static_field(default=4e-4)  # times the extent of the points, falls to a hundredth
+    scales_rate: float = static_field(default=1e-2)
+    quats_rate: float = static_field(default=2e-3)
+    opacities_rate: float = static_field(default=5e-2)
+    sh_rate: float = static_field(default=5e-3)  # a twentieth of it for the bands above 0
+    band_every: int = static_field(default=500)  # steps between one SH band and the next
+    relocate_every: int = static_field(default=100)  # steps; 0 never moves a splat
+    relocate_until: float = static_field(default=0.8)  # share of the steps
+    noise: float = static_field(default=2e3)  # of the centres, times their rate; 0 traces none
+    opacity_regularizer: float = static_field(default=0.002)
+    scale_regularizer: float = static_field(default=0.002)  # per extent of the points
+    evaluate_every: int = static_field(default=500)
+    seed: int = static_field(default=0)
+    render: RenderConfig = static_field(default=RenderConfig())  # noqa: RUF009  (frozen)
+
+
+class Progress(NamedTuple):
+    """Where a reconstruction stands."""
+
+    step: int
+    loss: float
+    psnr: float | None  # mean over held-out views [dB], where it was just evaluated
+    seconds: float  # spent on steps, compilation included
+
+
+@dataclass
+class Reconstruction:
+    """What a reconstruction hands back."""
+
+    gaussians: Gaussians
+    psnr: dict[str, float]  # per held-out view [dB]
+    ssim: dict[str, float]
+    history: list[Progress] = field(default_factory=list)
+    capacity: int = 0  # box/tile pairs that the lists were grown to
+    relocated: int = 0
+
+    @property
+    def mean_psnr(self) -> float:
+        """Mean PSNR over the held-out views [dB]; NaN without any."""
+        return float(np.mean(list(self.psnr.values()))) if self.psnr else float("nan")
+
+
+class FitState(eqx.Module):
+    """All that a resumed run needs; the random numbers follow from the step."""
+
+    gaussians: Gaussians
+    optimizer: Any
+    step: Int[Array, ""]
+    relocated: Int[Array, ""]
+
+
+def start_gaussians(
+    points: Float[np.ndarray, "n 3"], rgb: Float[np.ndarray, "n 3"], count: int, sh_degree: int, *, seed: int = 0
+) -> Gaussians:
+    """Small round Gaussians on sparse points, repeated with jitter up to `count`. Host.
+
+    Raises:
+        InputError: fewer than 4 points.
+    """
+    if len(points) < 4:
+        raise InputError(f"points: {len(points)} given; a reconstruction starts from at least 4.")
+    rng = np.random.default_rng(seed)
+    pick = np.concatenate([np.arange(min(count, len(points))), rng.integers(len(points), size=max(count - len(points), 0))])
+    gap = cKDTree(points).query(points, k=4)[0][:, 1:].mean(1)[pick]
+    jitter = rng.normal(size=(count, 3)) * 0.5 * gap[:, None] * (np.arange(count) >= len(points))[:, None]
+    scale = gap * (len(points) / max(count, len(points))) ** 0.5 * 0.7
+    sh = np.zeros((count, (sh_degree + 1) ** 2, 3))
+    sh[:, 0] = (rgb[pick] - 0.5) / _DC
+    quats = np.tile([1.0, 0, 0, 0], (count, 1))
+    values = points[pick] + jitter, np.log(np.maximum(scale, 1e-6))[:, None].repeat(3, 1), quats, np.full(count, -1.4), sh
+    return Gaussians(*(jnp.asarray(v, jnp.float32) for v in values))
+
+
+def random_points(cameras: Camera, count: int, *, seed: int = 0) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Grey points in the ball that the cameras look at, for captures without sparse points. Host."""
+    rng = np.random.default_rng(seed)
+    position, forward = np.asarray(cameras.position), np.asarray(cameras.world_to_cam)[:, 2, :3]
+    # the point nearest to all optical axes
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    centre = np.linalg.lstsq(across.sum(0), np.einsum("vij,vj->i", across, position), rcond=None)[0]
+    radius = 0.5 * np.linalg.norm(position - centre, axis=1).mean()
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return centre + direction * radius * rng.random((count, 1)) ** (1 / 3), np.full((count, 3), 0.5)
+
+
+def reconstruct(
+    views: io.Views,
+    config: FitConfig = FitConfig(),  # noqa: B008  (frozen)
+    *,
+    points: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]] | None = None,
+    checkpoint: Path | None = None,
+    callback: Callable[[Progress], None] | None = None,
+) -> Reconstruction:
+    """Fit Gaussians to the training views, and score the held-out ones (split "test"). Host.
+
+    Args:
+        views: photos with cameras.
+        config: steps, splats and rates.
+        points: positions [m] and colours of sparse points; None starts from random ones.
+        checkpoint: file that is written at every evaluation; if it exists the run goes on from it, with the same
+            result as an unbroken one.
+        callback: told the progress every few dozen steps.
+
+    Raises:
+        InputError: no training views, or too few points.
+    """
+    train = views.subset("train") if "train" in views.splits else views
+    held_out = views.subset("test") if "test" in views.splits else None
+    if points is None:
+        points = random_points(train.cameras, min(config.splats, 5000), seed=config.seed)
+    gaussians = start_gaussians(*points, config.splats, config.sh_degree, seed=config.seed)
+    extent = float(np.linalg.norm(np.std(points[0], axis=0))) or 1.0
+    optimizer = _optimizer(config, extent)
+    zero = jnp.zeros((), jnp.int32)
+    state = FitState(gaussians, optimizer.init(gaussians), zero, zero)
+    if checkpoint is not None and checkpoint.exists():
+        state = io.load_pytree(checkpoint, state)
+
+    capacity = int(1.25 * required_capacity(state.gaussians, views.cameras, config.render))
+    images = jnp.asarray(train.images)
+    result = Reconstruction(state.gaussians, {}, {}, capacity=capacity)
+    begun = time.perf_counter()
+    while (step := int(state.step)) < config.steps:
+        stop = min(config.steps, _next_multiple(step, config.relocate_every, config.evaluate_every, 50))
+        settings = _with_capacity(config, capacity)
+        moved, loss, overflow = _train(state, train.cameras, images, settings, optimizer, extent, stop - step)
+        if overflow > 0:
+            capacity = max(int(1.5 * capacity), required_capacity(moved.gaussians, views.cameras, config.render))
+            continue
+        state = moved
+        if config.relocate_every and stop % config.relocate_every == 0 and stop <= config.relocate_until * config.steps:
+            state = _relocate(state, config)
+        score = None
+        if stop % config.evaluate_every == 0 or stop == config.steps:
+            score = _score(state.gaussians, held_out, settings)[0]
+            if checkpoint is not None:
+                io.save_pytree(checkpoint, state)
+        mean = None if score is None else float(np.mean(list(score.values()))) if score else None
+        result.history.append(Progress(stop, float(loss), mean, time.perf_counter() - begun))
+        if callback is not None:
+            callback(result.history[-1])
+    psnrs, ssims = _score(state.gaussians, held_out, _with_capacity(config, capacity))
+    return replace(
+        result,
+        gaussians=state.gaussians,
+        psnr=psnrs,
+        ssim=ssims,
+        capacity=capacity,
+        relocated=int(state.relocated),
+    )
+
+
+def _next_multiple(step: int, *periods: int) -> int:
+    return min((step // p + 1) * p for p in periods if p)
+
+
+def _with_capacity(config: FitConfig, capacity: int) -> FitConfig:
+    return replace(config, render=replace(config.render, capacity=capacity))
+
+
+def _optimizer(config: FitConfig, extent: float) -> optax.GradientTransformation:
+    means_rate = optax.exponential_decay(config.means_rate * extent, config.steps, 0.01)
+    rates = {
+        "means": means_rate,
+        "log_scales": config.scales_rate,
+        "quats": config.quats_rate,
+        "logit_opacities": config.opacities_rate,
+        "sh": config.sh_rate,
+    }
+    return optax.partition(
+        {name: optax.adam(rate, eps=1e-15) for name, rate in rates.items()},
+        lambda tree: jax.tree_util.tree_map_with_path(lambda path, _: path[0].name, tree),
+    )
+
+
+def _band_rates(step: Int[Array, ""], config: FitConfig) -> Float[Array, "k 1"]:
+    """Share of the SH rate that each coefficient gets: higher bands wait for their turn and then move slowly."""
+    band = np.floor(np.sqrt(np.arange((config.sh_degree + 1) ** 2)))
+    return jnp.where(step >= band * config.band_every, np.where(band == 0, 1.0, 0.05), 0.0)[:, None]
+
+
+def _loss(gaussians: Gaussians, camera: Camera, image: Float[Array, "h w 3"], config: FitConfig, extent: float):
+    frame = render(gaussians, camera, config.render, background=config.background, outputs=("rgb",))
+    loss = (1 - config.ssim_weight) * jnp.mean(jnp.abs(frame.rgb - image))
+    if config.ssim_weight:
+        loss += config.ssim_weight * (1 - ssim(frame.rgb, image))
+    loss += config.opacity_regularizer * jnp.mean(jax.nn.sigmoid(gaussians.logit_opacities))
+    loss += config.scale_regularizer / extent * jnp.mean(jnp.exp(gaussians.log_scales))
+    return loss, frame.overflow
+
+
+@eqx.filter_jit
+def _train(state: FitState, cameras: Camera, images, config: FitConfig, optimizer, extent: float, count: int):
+    """`count` steps: the state after them, their mean loss, and the most list entries that were dropped."""
+    views = images.shape[0]
+
+    def one(state: FitState, _):
+        key = jax.random.fold_in(jax.random.key(config.seed), state.step)
+        # every view once per round, in a new order each round
+        order = jax.random.permutation(jax.random.fold_in(jax.random.key(config.seed + 1), state.step // views), views)
+        view = order[state.step % views]
+        camera = cameras[view]
+        (loss, overflow), gradient = eqx.filter_value_and_grad(_loss, has_aux=True)(
+            state.gaussians, camera, images[view], config, extent
+        )
+        updates, moments = optimizer.update(gradient, state.optimizer, state.gaussians)
+        updates = eqx.tree_at(lambda g: g.sh, updates, updates.sh * _band_rates(state.step, config))
+        gaussians = optax.apply_updates(state.gaussians, updates)
+        if config.noise:
+            rate = config.means_rate * extent * 0.01 ** (state.step / config.steps)
+            gaussians = shake(gaussians, key, config.noise * rate)
+        return FitState(gaussians, moments, state.step + 1, state.relocated), (loss, overflow)
+
+    state, (loss, overflow) = lax.scan(one, state, length=count)
+    return state, jnp.mean(loss), jnp.max(overflow)
+
+
+@eqx.filter_jit
+def _relocate(state: FitState, config: FitConfig) -> FitState:
+    key = jax.random.fold_in(jax.random.key(config.seed + 2), state.step)
+    gaussians, keep, moved = relocate(state.gaussians, key)
+    count = len(gaussians)
+
+    def forget(moment):
+        if eqx.is_inexact_array(moment) and moment.ndim and moment.shape[0] == count:
+            return moment * keep.reshape(-1, *([1] * (moment.ndim - 1)))
+        return moment
+
+    return FitState(gaussians, jax.tree.map(forget, state.optimizer), state.step, state.relocated + moved)
+
+
+def _score(gaussians: Gaussians, held_out: io.Views | None, config: FitConfig) -> tuple[dict, dict]:
+    """PSNR [dB] and SSIM of each held-out view by name."""
+    if held_out is None:
+        return {}, {}
+    scores = _score_views(gaussians, held_out.cameras, jnp.asarray(held_out.images), config)
+    return tuple(dict(zip(held_out.names, map(float, values))) for values in scores)
+
+
+@eqx.filter_jit
+def _score_views(gaussians: Gaussians, cameras: Camera, images, config: FitConfig):
+    def one(pair):
+        camera, image = pair
+        rgb = render(gaussians, camera, config.render, background=config.background, outputs=("rgb",)).rgb
+        rgb = jnp.clip(rgb, 0, 1)
+        return psnr(rgb, image), ssim(rgb, image)
+
+    return lax.map(one, (cameras, images))

@@ -1,0 +1,320 @@
+"""The renderer against a dense float64 compositor, gsplat's own numbers, and central differences."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from dense import dense_render
+
+import pigjax.splat as splat_module
+from pigjax.camera import Camera, look_at
+from pigjax.errors import InputError
+from pigjax.splat import OUTPUTS, Gaussians, RenderConfig, render, required_capacity, surface_depth
+
+EXACT = RenderConfig(alpha_min=1e-7, transmittance_min=0.0, capacity=60_000)
+
+
+def make_scene(count=60, seed=0, width=40, height=28, degree=3, spread=1.0):
+    rng = np.random.default_rng(seed)
+    scene = {
+        "means": rng.normal(0, 0.5 * spread, (count, 3)),
+        "quats": rng.normal(size=(count, 4)),
+        "scales": np.exp(rng.normal(np.log(0.08), 0.6, (count, 3))),
+        "opacities": rng.uniform(0.05, 0.98, count),
+        "sh": rng.normal(0, 0.2, (count, (degree + 1) ** 2, 3)),
+    }
+    camera = look_at(np.array([1.2, -2.0, 1.0]), np.zeros(3), focal=45.0, width=width, height=height)
+    camera = Camera(camera.world_to_cam, camera.focal * np.array([1.0, 1.1]), camera.centre + 1.3, width, height)
+    return scene, camera
+
+
+def gaussians_of(scene):
+    logit = np.log(scene["opacities"] / (1 - scene["opacities"]))
+    return Gaussians(scene["means"], np.log(scene["scales"]), scene["quats"], logit, scene["sh"])
+
+
+def dense(scene, camera, config, **kwargs):
+    values = [np.asarray(v, np.float64) for v in (camera.world_to_cam, camera.focal, camera.centre)]
+    return dense_render(
+        **scene,
+        view=values[0],
+        focal=values[1],
+        centre=values[2],
+        width=camera.width,
+        height=camera.height,
+        config=config,
+        **kwargs,
+    )
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("antialias", [False, True])
+def test_every_output_equals_the_dense_compositor(degree, antialias):
+    scene, camera = make_scene(degree=degree, seed=degree)
+    config = RenderConfig(antialias=antialias)
+    membership = np.random.default_rng(1).random((60, 3))
+    frame = render(gaussians_of(scene), camera, config, outputs=OUTPUTS, object_weights=jnp.asarray(membership))
+    rgb, alpha, depth, surface, objects = dense(scene, camera, config, weights=membership)
+    # float32 rounding of colours of order 1 blended over at most 60 splats
+    for ours, truth in ((frame.rgb, rgb), (frame.alpha, alpha), (frame.object_weights, objects)):
+        assert np.abs(ours - truth).max() < 2e-5
+    seen = alpha > 1e-3
+    assert np.abs(frame.depth - depth)[seen].max() < 1e-3
+    np.testing.assert_array_equal(np.isnan(frame.surface_depth), np.isnan(surface))
+    np.testing.assert_allclose(frame.surface_depth, surface, rtol=1e-5)
+    assert frame.overflow == 0
+
+
+def test_exact_settings_equal_the_dense_compositor_with_the_same_thresholds_in_float64(x64):
+    scene, camera = make_scene()
+    frame = render(gaussians_of(scene), camera, EXACT, outputs=("rgb", "alpha"))
+    rgb, alpha, *_ = dense(scene, camera, EXACT)
+    assert np.abs(frame.rgb - rgb).max() < 1e-12
+    assert np.abs(frame.alpha - alpha).max() < 1e-12
+
+
+def test_default_thresholds_cost_less_than_60_dB(x64):
+    scene, camera = make_scene(count=300, spread=0.6)
+    default = render(gaussians_of(scene), camera, RenderConfig(), background=1.0).rgb
+    exact = render(gaussians_of(scene), camera, EXACT, background=1.0).rgb
+    psnr = -10 * np.log10(np.mean((default - exact) ** 2))
+    print(f"defaults against exact settings: {psnr:.1f} dB, worst {np.abs(default - exact).max():.1e}")
+    assert psnr > 50 and np.abs(default - exact).max() < 2e-2
+
+
+@pytest.fixture(scope="module")
+def gsplat_reference():
+    data = dict(np.load(Path(__file__).parent / "data" / "gsplat_reference.npz"))
+    k = data["in_K"]
+    logit = np.log(data["in_opacities"] / (1 - data["in_opacities"]))
+    gaussians = Gaussians(data["in_means"], np.log(data["in_scales"]), data["in_quats"], logit, data["in_sh"])
+    size = int(data["in_width"]), int(data["in_height"])
+    return data, gaussians, Camera(data["in_viewmat"], k[[0, 1], [0, 1]], k[:2, 2], *size)
+
+
+# gsplat caps alpha at 0.999
+GSPLAT = RenderConfig(alpha_max=0.999)
+
+
+def test_images_equal_gsplat(gsplat_reference):
+    data, gaussians, camera = gsplat_reference
+    frame = render(gaussians, camera, GSPLAT, outputs=("rgb", "alpha", "depth", "surface_depth"))
+    for name in ("rgb", "alpha"):
+        error = np.abs(getattr(frame, name) - data[name])
+        psnr = -10 * np.log10(np.mean(error**2))
+        print(f"{name} against gsplat: {psnr:.1f} dB, worst {error.max():.1e}")
+        assert psnr >= 60 and error.max() < 5e-3
+    np.testing.assert_allclose(np.nan_to_num(frame.surface_depth), data["surface_depth"], rtol=1e-4)
+    antialiased = render(gaussians, camera, RenderConfig(alpha_max=0.999, antialias=True)).rgb
+    assert np.abs(antialiased - data["rgb_antialiased"]).max() < 5e-3
+
+
+def test_gradients_equal_gsplat(gsplat_reference):
+    data, gaussians, camera = gsplat_reference
+
+    def loss(means, quats, scales, opacities, sh, viewmat, focal):
+        logit = jnp.log(opacities / (1 - opacities))
+        moved = Camera(viewmat, focal, camera.centre, camera.width, camera.height)
+        frame = render(
+            Gaussians(means, jnp.log(scales), quats, logit, sh), moved, GSPLAT, outputs=("rgb", "alpha", "depth")
+        )
+        depth = frame.depth * frame.alpha
+        return (
+            jnp.sum(frame.rgb * data["g_rgb"])
+            + jnp.sum(frame.alpha * data["g_alpha"])
+            + jnp.sum(depth * data["g_depth_acc"])
+        )
+
+    names = ["means", "quats", "scales", "opacities", "sh", "viewmat"]
+    inputs = [jnp.asarray(data["in_" + name]) for name in names] + [camera.focal]
+    gradients = jax.grad(loss, argnums=tuple(range(7)))(*inputs)
+    for name, ours in zip([*names, "focal"], gradients):
+        truth = data["d_" + name] if name != "focal" else np.diag(data["d_K"])[:2]
+        error = np.linalg.norm(ours - truth) / np.linalg.norm(truth)
+        print(f"gradient to {name} against gsplat float64: relative error {error:.1e}")
+        assert error < 2e-3, name
+
+
+def scalar_loss(gaussians, camera, config, weights):
+    frame = render(
+        gaussians,
+        camera,
+        config,
+        background=0.3,
+        outputs=("rgb", "alpha", "depth", "object_weights", "surface_depth"),
+        object_weights=jax.nn.sigmoid(gaussians.means),
+    )
+    terms = [
+        frame.rgb,
+        frame.alpha[..., None],
+        frame.depth[..., None],
+        frame.object_weights,
+        jnp.nan_to_num(frame.surface_depth)[..., None],
+    ]
+    return jnp.sum(jnp.concatenate(terms, -1) * weights)
+
+
+@pytest.mark.parametrize("part", ["means", "log_scales", "quats", "logit_opacities", "sh", "pose", "focal", "centre"])
+def test_gradients_equal_central_differences(x64, part):
+    scene, camera = make_scene(count=25, width=24, height=20)
+    gaussians = gaussians_of(scene)
+    rng = np.random.default_rng(2)
+    weights = jnp.asarray(rng.normal(size=(20, 24, 9)))
+    # thresholds make jumps that a difference quotient sees and a derivative does not: switch them off
+    config = RenderConfig(alpha_min=1e-9, alpha_max=1.0, transmittance_min=0.0, capacity=2_000)
+
+    fields = {"pose": "world_to_cam", "focal": "focal", "centre": "centre"}
+
+    def moved(step):
+        import equinox as eqx
+
+        if part in fields:
+            where = lambda c: getattr(c, fields[part])  # noqa: E731
+            return gaussians, eqx.tree_at(where, camera, where(camera) + step)
+        where = lambda g: getattr(g, part)  # noqa: E731
+        return eqx.tree_at(where, gaussians, where(gaussians) + step), camera
+
+    shape = getattr(camera, fields[part]).shape if part in fields else getattr(gaussians, part).shape
+    direction = jnp.asarray(rng.normal(size=shape))
+    if part == "pose":
+        direction = direction.at[3].set(0.0)
+    f = jax.jit(lambda t: scalar_loss(*moved(t * direction), config, weights))
+    h = 1e-6
+    central = (f(h) - f(-h)) / (2 * h)
+    np.testing.assert_allclose(jax.grad(f)(0.0), central, rtol=2e-5)
+
+
+def test_forward_mode_and_hessian_agree_with_reverse_mode(x64):
+    scene, camera = make_scene(count=6, width=8, height=8, degree=0)
+    gaussians = gaussians_of(scene)
+
+    def loss(means, differentiation):
+        config = RenderConfig(differentiation=differentiation, capacity=64)
+        moved = Gaussians(means, gaussians.log_scales, gaussians.quats, gaussians.logit_opacities, gaussians.sh)
+        return jnp.sum(render(moved, camera, config).rgb ** 2)
+
+    reverse = jax.grad(loss)(gaussians.means, "reverse")
+    np.testing.assert_allclose(jax.jacfwd(loss)(gaussians.means, "forward"), reverse, rtol=1e-9, atol=1e-12)
+    hessian = jax.jacfwd(jax.jacfwd(loss))(gaussians.means, "forward").reshape(18, 18)
+    np.testing.assert_allclose(hessian, hessian.T, atol=1e-9)
+    direction = np.random.default_rng(0).normal(size=(6, 3))
+    h = 1e-6
+    central = (
+        jax.grad(loss)(gaussians.means + h * direction, "reverse")
+        - jax.grad(loss)(gaussians.means - h * direction, "reverse")
+    ) / (2 * h)
+    np.testing.assert_allclose((hessian @ direction.ravel()).reshape(6, 3), central, rtol=1e-4, atol=1e-6)
+
+
+DEGENERATE = {
+    "needle": {"scales": [1e-5, 1e-1, 1e-5]},
+    "zero opacity": {"opacities": 0.0},
+    "full opacity": {"opacities": 1.0},
+    "zero quaternion": {"quats": [0.0, 0.0, 0.0, 0.0]},
+    "on the near plane": {"means": "near"},
+    "behind the camera": {"means": "behind"},
+    "covers everything": {"scales": [50.0, 50.0, 50.0]},
+    "equal depths": {"means": [0.0, 0.0, 0.0]},
+    "zero scale": {"scales": [0.0, 0.0, 0.0]},
+}
+
+
+@pytest.mark.parametrize("case", DEGENERATE)
+def test_degenerate_splats_draw_right_and_have_finite_gradients(case):
+    scene, camera = make_scene(count=12, width=20, height=12, degree=1)
+    position = np.linalg.inv(camera.world_to_cam)
+    for name, value in DEGENERATE[case].items():
+        value = {"near": position[:3, 3] + 0.01 * position[:3, 2], "behind": position[:3, 3] - position[:3, 2]}.get(
+            value if isinstance(value, str) else None, value
+        )
+        scene[name][:3] = value
+
+    def loss(means, scales, quats, opacities, sh):
+        splats = splat_module.Splats(means, splat_module.quat_to_matrix(quats) * scales[:, None], opacities, sh)
+        frame = render(splats, camera)
+        return jnp.sum(frame.rgb**2), frame
+
+    inputs = [jnp.asarray(scene[k], jnp.float32) for k in ("means", "scales", "quats", "opacities", "sh")]
+    (_, frame), gradients = jax.value_and_grad(loss, argnums=tuple(range(5)), has_aux=True)(*inputs)
+    if case != "zero quaternion":
+        rgb, alpha, *_ = dense(scene, camera, RenderConfig())
+        assert np.abs(frame.rgb - rgb).max() < 2e-4, case
+    assert all(np.isfinite(g).all() for g in gradients)
+
+
+def test_empty_scene_is_background_and_one_pixel_image_works():
+    scene, camera = make_scene(count=3, width=1, height=1, degree=0)
+    gaussians = gaussians_of(scene)
+    empty = jax.tree.map(lambda v: v[:0], gaussians)
+    assert np.asarray(render(empty, camera, background=0.25).rgb).tolist() == [[[0.25] * 3]]
+    assert np.isnan(surface_depth(empty, camera)).all()
+    rgb, *_ = dense(scene, camera, RenderConfig())
+    assert np.abs(render(gaussians, camera).rgb - rgb).max() < 1e-5
+
+
+def test_overflow_is_counted_drops_the_farthest_and_required_capacity_is_enough():
+    scene, camera = make_scene(count=200)
+    gaussians = gaussians_of(scene)
+    need = required_capacity(gaussians, camera)
+    full = render(gaussians, camera, RenderConfig(capacity=need))
+    short = render(gaussians, camera, RenderConfig(capacity=need - 50))
+    assert full.overflow == 0
+    assert short.overflow == 50
+    order = np.argsort(np.asarray(scene["means"] @ np.asarray(camera.world_to_cam)[2, :3]))
+    near = jax.tree.map(lambda v: v[order[:100]], gaussians)
+    np.testing.assert_allclose(render(near, camera, RenderConfig(capacity=need - 50)).overflow, 0)
+
+
+def test_two_key_sort_draws_the_same_picture(monkeypatch):
+    scene, camera = make_scene(count=50)
+    one_key = render(gaussians_of(scene), camera).rgb
+    monkeypatch.setattr("pigjax.tiles._KEY_LIMIT", 10)
+    np.testing.assert_array_equal(render(gaussians_of(scene), camera).rgb, one_key)
+
+
+def test_vmap_over_cameras_and_over_splats_equals_one_by_one():
+    scene, camera = make_scene(count=30)
+    gaussians = gaussians_of(scene)
+    cameras = jax.tree.map(lambda v: jnp.stack([v, v.at[..., -1].add(0.1)]), camera)
+    batch = jax.vmap(lambda c: render(gaussians, c).rgb)(cameras)
+    for k in range(2):
+        np.testing.assert_allclose(batch[k], render(gaussians, cameras[k]).rgb, atol=1e-6)
+    both = jax.tree.map(lambda v: jnp.stack([v, v + 0.01]), gaussians)
+    batch = jax.vmap(lambda g: render(g, camera).rgb)(both)
+    np.testing.assert_allclose(batch[1], render(jax.tree.map(lambda v: v[1], both), camera).rgb, atol=1e-6)
+
+
+def test_only_the_outputs_asked_for_are_traced():
+    scene, camera = make_scene(count=10)
+    gaussians = gaussians_of(scene)
+    alone = jax.make_jaxpr(lambda g: render(g, camera, outputs=("alpha",)).alpha)(gaussians)
+    coloured = jax.make_jaxpr(lambda g: render(g, camera, outputs=("alpha", "rgb")).alpha)(gaussians)
+    # the loop's table has 6 shape columns, and 3 more where colours are drawn
+    assert ",6]" in str(alone)
+    assert ",9]" not in str(alone)
+    assert ",9]" in str(coloured)
+
+
+def test_colour_turns_with_the_local_rotation():
+    scene, camera = make_scene(count=1, degree=3)
+    angle = 0.7
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+    scene["means"][:] = 0
+    splats = splat_module.as_splats(gaussians_of(scene))
+    turned = splat_module.Splats(splats.means, turn @ splats.factors, splats.opacities, splats.sh, turn[None])
+    orbit = camera.world_to_cam.at[:3, :3].set(camera.world_to_cam[:3, :3] @ turn.T)
+    turned_camera = Camera(orbit, camera.focal, camera.centre, camera.width, camera.height)
+    np.testing.assert_allclose(render(turned, turned_camera).rgb, render(splats, camera).rgb, atol=1e-5)
+
+
+def test_unknown_output_and_missing_object_weights_are_clear_errors():
+    scene, camera = make_scene(count=2)
+    with pytest.raises(InputError, match=r"outputs = \('colour',\): choose from rgb"):
+        render(gaussians_of(scene), camera, outputs=("colour",))
+    with pytest.raises(InputError, match="pass object_weights"):
+        render(gaussians_of(scene), camera, outputs=("object_weights",))
+    bad = Gaussians(np.zeros((1, 3)), np.zeros((1, 3)), np.ones((1, 4)), np.zeros(1), np.zeros((1, 5, 3)))
+    with pytest.raises(InputError, match="5 coefficients"):
+        render(bad, camera)
