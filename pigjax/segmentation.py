@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -277,7 +277,7 @@ def _credits(splats: Splats, camera: Camera, mask, num_ids: int, config: RenderC
 
 def _draw(output: str, splats: Splats, camera: Camera, config: RenderConfig, **options) -> tuple[Array, Array]:
     """One output of the renderer, and the pairs that it dropped."""
-    frame = render(splats, camera, config, outputs=(output,), **options)
+    frame: Any = render(splats, camera, config, outputs=(output,), **options)
     return getattr(frame, output), frame.overflow
 
 
