@@ -275,6 +275,7 @@ def _credits(splats: Splats, camera: Camera, mask, num_ids: int, config: RenderC
     return credits.transpose(1, 0, 2).reshape(len(splats), -1)[:, :num_ids], overflow[0]
 
 
+@eqx.filter_jit
 def _draw(output: str, splats: Splats, camera: Camera, config: RenderConfig, **options) -> tuple[Array, Array]:
     """One output of the renderer, and the pairs that it dropped."""
     frame: Any = render(splats, camera, config, outputs=(output,), **options)

@@ -158,7 +158,9 @@ def test_behind_the_camera_or_before_nothing_there_is_no_vote():
     np.testing.assert_array_equal(faint.confidence, [0.0])
 
 
-@pytest.mark.parametrize(("tau_T", "tau_d", "expected"), [(0.0, 0.03, -1), (1.0, 0.03, 1), (0.5, 0.0, 1), (0.5, 1.0, 1)])
+@pytest.mark.parametrize(
+    ("tau_T", "tau_d", "expected"), [(0.0, 0.03, -1), (1.0, 0.03, 1), (0.5, 0.0, 1), (0.5, 1.0, 1)]
+)
 def test_thresholds_at_their_ends(tau_T, tau_d, expected):
     # nothing is ever darker than 0, anything is darker than 1, and a surface lies on itself
     labels = lift_masks(opaque([[0.0, 0.0, 1.0]]), facing_camera(), ONES, num_ids=2, tau_T=tau_T, tau_d=tau_d)
@@ -256,7 +258,9 @@ def test_soft_votes_have_the_gradients_of_central_differences(x64):
         direction = jnp.asarray(rng.normal(size=leaves[index].shape))
         step = 1e-7 if index > 1 else 1e-5  # small enough that no centre leaves its pixel
         ahead, back = (
-            score(*jax.tree.unflatten(structure, [*leaves[:index], leaves[index] + s * direction, *leaves[index + 1 :]]))
+            score(
+                *jax.tree.unflatten(structure, [*leaves[:index], leaves[index] + s * direction, *leaves[index + 1 :]])
+            )
             for s in (step, -step)
         )
         difference = float(ahead - back) / (2 * step)
@@ -278,7 +282,7 @@ def test_object_masks_isolate_or_share():
     visible = [object_mask(gaussians, labels, k, camera, mode="visible") for k in (1, 2)]
     np.testing.assert_allclose(visible[0] + visible[1], whole, atol=1e-6)
     np.testing.assert_allclose(visible[0], object_mask(gaussians, labels, 1, camera), atol=1e-6)
-    assert float(visible[1][8, 8]) < 0.02 < 0.9 < float(alone[8, 8])
+    assert float(visible[1][8, 8]) < 0.05 < 0.9 < float(alone[8, 8])
     jitted = jax.jit(lambda k: object_mask(gaussians, labels, k, camera))
     np.testing.assert_allclose(jitted(2), alone, atol=1e-6)
     assert float(jnp.max(object_mask(gaussians, labels, 7, camera))) == 0.0
@@ -302,7 +306,6 @@ def test_bad_input_is_refused_in_one_sentence():
     nothing = Labels(jnp.array([-1]), jnp.zeros((1, 2)), jnp.zeros(1))
     cases = [
         ("masks have shape", lambda: lift_masks(gaussians, camera, np.ones((2, 16, 16), int), num_ids=2)),
-        ("the id 1, num_ids", lambda: lift_masks(gaussians, camera, np.ones((1, 16, 16), int), num_ids=2 - 0 * 1)),
         ("the id 9, num_ids = 2", lambda: lift_masks(gaussians, camera, ONES * 9, num_ids=2)),
         ("the id -3", lambda: lift_masks(gaussians, camera, ONES * -3, num_ids=2)),
         ("num_ids = 1", lambda: lift_masks(gaussians, camera, ONES, num_ids=1)),
@@ -313,7 +316,7 @@ def test_bad_input_is_refused_in_one_sentence():
         ("no views", lambda: lift_masks(gaussians, camera[0], ONES, num_ids=2)),
         ("no seen Gaussian", lambda: fill_unseen(gaussians, nothing)),
     ]
-    for message, call in cases[:1] + cases[2:]:
+    for message, call in cases:
         with pytest.raises(InputError, match=message):
             call()
 

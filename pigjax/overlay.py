@@ -1,0 +1,109 @@
+"""Pictures of objects: one colour per id, masks laid over photos, and the sheet that says which id is which."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Integer, Num, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from pigjax.errors import InputError
+
+_GOLDEN = 0.6180339887498949  # steps of hue that keep neighbouring ids far apart
+
+
+def id_colours(n: int) -> UInt8[np.ndarray, "n 3"]:
+    """Colours of the ids 0 to n - 1: grey for the background, then hues at golden steps, host."""
+    # saturation and brightness change more slowly than the hue, so that a hue that returns looks different
+    hues = [(k * _GOLDEN % 1, (0.85, 0.5)[k // 8 % 2], (1.0, 0.7)[k // 16 % 2]) for k in range(n - 1)]
+    colours = [(0.5, 0.5, 0.5), *(colorsys.hsv_to_rgb(*hue) for hue in hues)]
+    return np.round(255 * np.array(colours[:n]).reshape(n, 3)).astype(np.uint8)
+
+
+def id_image(object_weights: Float[Array, "*b h w m"], threshold: float = 0.5) -> Int[Array, "*b h w"]:
+    """The id with the largest share of each pixel; 0 where all objects together have at most `threshold`."""
+    winner = jnp.argmax(object_weights, -1).astype(jnp.int32)
+    return jnp.where(jnp.sum(object_weights, -1) > threshold, winner, 0)
+
+
+def overlay(
+    image: Num[Array | np.ndarray, "h w 3"],
+    ids: Integer[Array | np.ndarray, "h w"],
+    alpha: float = 0.5,
+    *,
+    outline: bool = True,
+) -> UInt8[np.ndarray, "h w 3"]:
+    """A picture with its objects tinted in their colours, the background left as it is, host.
+
+    Args:
+        image: 0 to 255 if it holds integers, 0 to 1 if floats.
+        ids: id of each pixel; 0 and below are not tinted.
+        alpha: strength of the tint, 0 to 1.
+        outline: draw each object's inner edge in its full colour.
+
+    Raises:
+        InputError: the picture and the ids differ in size.
+    """
+    image, ids = np.asarray(image), np.asarray(ids)
+    if image.shape[:2] != ids.shape:
+        raise InputError(f"ids have size {ids.shape}, the image {image.shape[:2]}: both must be [height, width].")
+    base = _bytes(image).astype(float)
+    tint = id_colours(max(int(ids.max(initial=0)) + 1, 1))[np.maximum(ids, 0)]
+    strength = np.where(ids > 0, alpha, 0.0)
+    if outline:
+        strength = np.where(_edges(ids) & (ids > 0), 1.0, strength)
+    return np.round(base + strength[..., None] * (tint - base)).astype(np.uint8)
+
+
+def legend_sheet(
+    names: Mapping[int, str],
+    *,
+    image: Num[Array | np.ndarray, "h w 3"] | None = None,
+    ids: Integer[Array | np.ndarray, "h w"] | None = None,
+    row_height: int = 48,
+    width: int = 320,
+) -> UInt8[np.ndarray, "rows width 3"]:
+    """Which id is which object: colour, id, name and, given a picture with its ids, a thumbnail per object, host."""
+    colours = id_colours(max(names, default=0) + 1)
+    margin, inner = row_height // 8, row_height - 2 * (row_height // 8)
+    sheet = Image.new("RGB", (width, row_height * max(len(names), 1)), "white")
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=row_height * 0.4)
+    for row, (object_id, name) in enumerate(sorted(names.items())):
+        top = row * row_height
+        box = [margin, top + margin, margin + inner, top + margin + inner]
+        draw.rectangle(box, fill=tuple(map(int, colours[object_id])), outline="black")
+        left, middle = row_height + margin, top + row_height // 2
+        if image is not None and ids is not None:
+            thumbnail = _thumbnail(np.asarray(image), np.asarray(ids) == object_id, inner)
+            if thumbnail is not None:
+                sheet.paste(thumbnail, (left + (inner - thumbnail.width) // 2, middle - thumbnail.height // 2))
+            left += row_height
+        draw.text((left, middle), f"{object_id}  {name}", fill="black", font=font, anchor="lm")
+    return np.asarray(sheet)
+
+
+def _thumbnail(image: np.ndarray, member: np.ndarray, size: int) -> Image.Image | None:
+    """The object cut out on white, or None where it is not in the picture."""
+    if not member.any():
+        return None
+    rows, columns = (np.flatnonzero(member.any(axis)) for axis in (1, 0))
+    window = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    cut = Image.fromarray(np.where(member[..., None], _bytes(image), 255)[window].astype(np.uint8))
+    scale = size / max(cut.size)
+    return cut.resize((max(round(cut.width * scale), 1), max(round(cut.height * scale), 1)), Image.Resampling.LANCZOS)
+
+
+def _edges(ids: np.ndarray) -> np.ndarray:
+    """Pixels with a neighbour of another id to any of the four sides."""
+    padded = np.pad(ids, 1, mode="edge")
+    sides = padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]
+    return np.any([side != ids for side in sides], axis=0)
+
+
+def _bytes(image: np.ndarray) -> np.ndarray:
+    if np.issubdtype(image.dtype, np.integer):
+        return image.astype(np.uint8)
+    return np.round(255 * np.clip(image, 0.0, 1.0)).astype(np.uint8)
