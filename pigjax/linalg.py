@@ -180,7 +180,9 @@ def _decompose(matrix):
     second, u1 = _length_and_direction(b[:3] - _dot(u0, b[:3]) * u0, parallel, _perpendicular(u0))
     u2 = jnp.cross(u0, u1, axis=0)
     u = jnp.moveaxis(jnp.stack([u0, u1, u2], 1), (0, 1), (-2, -1))
-    s = jnp.stack([first, second, _dot(u2, c[:3])], -1) * scale[..., None]
+    second = jnp.minimum(first, second)
+    third = jnp.clip(_dot(u2, c[:3]), -second, second)
+    s = jnp.stack([first, second, third], -1) * scale[..., None]
     v = jnp.moveaxis(jnp.stack([a[3:], b[3:], c[3:]], 1), (0, 1), (-2, -1))
     return u, s, v, matmul3(u, transpose(v)), matmul3(v * s[..., None, :], transpose(v))
 
@@ -191,8 +193,9 @@ def _decompose_jvp(primals, tangents):
     (tangent,) = tangents
     u, s, v, rotation, stretch = _decompose(*primals)
     turned = matmul3(transpose(u), matmul3(tangent, v))
-    total, gap = s[..., None, :] + s[..., :, None], s[..., None, :] - s[..., :, None]
-    noise = 16 * jnp.finfo(s.dtype).eps * (jnp.abs(s[..., None, :]) + jnp.abs(s[..., :, None]))
+    row, column, magnitude = s[..., :, None], s[..., None, :], jnp.abs(s)
+    gap, total = column - row, (column + row) * (1 - jnp.eye(3, dtype=s.dtype))
+    noise = 16 * jnp.finfo(s.dtype).eps * (magnitude[..., :, None] + magnitude[..., None, :])
     even = _divide(turned + transpose(turned), gap, noise)
     odd = _divide(turned - transpose(turned), total, noise)
     du, dv = matmul3(u, (even + odd) / 2), matmul3(v, (even - odd) / 2)
