@@ -25,7 +25,12 @@ class FilledPoints(NamedTuple):
 
 
 def fill_interior(
-    gaussians: Gaussians, *, spacing: float, particles_per_cell: float = 8, seed: int = 0, max_cells: int = 64
+    gaussians: Gaussians,
+    *,
+    spacing: float | int,
+    particles_per_cell: float | int = 8,
+    seed: int = 0,
+    max_cells: int = 64,
 ) -> FilledPoints:
     """Points on a jittered lattice inside the shell that Gaussians make, host.
 
@@ -43,7 +48,7 @@ def fill_interior(
     return fill_solid(solid, lattice_step(spacing, particles_per_cell), seed=seed)
 
 
-def lattice_step(spacing: float, particles_per_cell: float) -> float:
+def lattice_step(spacing: float | int, particles_per_cell: float | int) -> float:
     """Distance between lattice points [m] that puts so many of them in each cell.
 
     Raises:

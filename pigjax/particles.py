@@ -44,9 +44,9 @@ def seed_particles(
     materials: Mapping[int, Material],
     *,
     fill: bool = True,
-    spacing: float | None = None,
+    spacing: float | int | None = None,
     velocities: Mapping[int, Any] | None = None,
-    particles_per_cell: float = 8,
+    particles_per_cell: float | int = 8,
     gaussians_per_cell: int | None = None,
     seed: int = 0,
     max_cells: int = 64,
@@ -143,7 +143,7 @@ def _check_ids(object_id: np.ndarray, materials: Mapping[int, Material], velocit
             raise InputError(f"velocities has object {name}, which has no material: give it one, or leave it out.")
 
 
-def _step(objects: list[_Object], spacing: float | None, particles_per_cell: float) -> float:
+def _step(objects: list[_Object], spacing: float | int | None, particles_per_cell: float | int) -> float:
     if spacing is not None:
         return lattice_step(spacing, particles_per_cell)
     volume = sum(item.solid.volume for item in objects)
