@@ -1,1 +1,91 @@
-"""pigjax: differentiable physics in 3D Gaussian splat scenes."""
+"""pigjax: differentiable physics in 3D Gaussian splat scenes.
+
+The way of the data: files (`io`) → Gaussians (`reconstruct`, `splat`) → objects (`segmentation`) → matter (`particles`,
+`mls_mpm`, `materials`, `colliders`) → posed splats (`clamp`) → pictures (`splat`) → video. `scene` runs all of it from
+one file.
+"""
+
+from pigjax.camera import Camera, interpolate_path, look_at, orbit, stack_cameras
+from pigjax.clamp import ClampParams, eigen_clamp
+from pigjax.colliders import Box, Plane, SampledDistance, Sphere
+from pigjax.errors import InputError, MissingFileError, SceneError, SimulationError
+from pigjax.io import Views, load_masks, load_ply, load_points, load_views, save_ply, write_video
+from pigjax.materials import Material, MaterialTable, material_table, preset
+from pigjax.matter import Grid, Health, Particles, Trajectory, fit_grid, make_particles
+from pigjax.metrics import boundary_iou, mean_iou, psnr, ssim
+from pigjax.mls_mpm import SimConfig, choose_substeps, rollout, stable_dt, step
+from pigjax.particles import at_frame, bind, deform, seed_particles
+from pigjax.reconstruct import FitConfig, reconstruct
+from pigjax.scene import RunReport, Scene, load_scene, run_scene
+from pigjax.segmentation import Labels, fill_unseen, lift_masks, object_mask
+from pigjax.solids import collider_from_gaussians
+from pigjax.splat import Frame, Gaussians, RenderConfig, Splats, render, required_capacity, surface_depth
+
+__version__ = "0.1.0"
+
+
+__all__ = [
+    "Box",
+    "Camera",
+    "ClampParams",
+    "FitConfig",
+    "Frame",
+    "Gaussians",
+    "Grid",
+    "Health",
+    "InputError",
+    "Labels",
+    "Material",
+    "MaterialTable",
+    "MissingFileError",
+    "Particles",
+    "Plane",
+    "RenderConfig",
+    "RunReport",
+    "SampledDistance",
+    "Scene",
+    "SceneError",
+    "SimConfig",
+    "SimulationError",
+    "Sphere",
+    "Splats",
+    "Trajectory",
+    "Views",
+    "at_frame",
+    "bind",
+    "boundary_iou",
+    "choose_substeps",
+    "collider_from_gaussians",
+    "deform",
+    "eigen_clamp",
+    "fill_unseen",
+    "fit_grid",
+    "interpolate_path",
+    "lift_masks",
+    "load_masks",
+    "load_ply",
+    "load_points",
+    "load_scene",
+    "load_views",
+    "look_at",
+    "make_particles",
+    "material_table",
+    "mean_iou",
+    "object_mask",
+    "orbit",
+    "preset",
+    "psnr",
+    "reconstruct",
+    "render",
+    "required_capacity",
+    "rollout",
+    "run_scene",
+    "save_ply",
+    "seed_particles",
+    "ssim",
+    "stable_dt",
+    "stack_cameras",
+    "step",
+    "surface_depth",
+    "write_video",
+]

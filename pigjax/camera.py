@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from pigjax.arrays import Vector, array_field, static_field
@@ -103,8 +106,8 @@ def orbit(
     width: int,
     height: int,
     start: float = 0.0,
-    sweep: float = 2 * jnp.pi,
-    up: int = 2,
+    sweep: float = 2 * np.pi,
+    up: Vector = (0.0, 0.0, 1.0),
 ) -> Camera:
     """Batch of cameras on a circle around `target`.
 
@@ -116,20 +119,19 @@ def orbit(
         focal: focal length [px].
         width: image width [px].
         height: image height [px].
-        start: first azimuth [rad].
+        start: first azimuth, from the x axis (from z where x points up) [rad].
         sweep: angle covered; the last camera stops one step before it so that a full circle loops [rad].
-        up: index of the world axis that points up.
+        up: axis that points up.
     """
-    azimuth = start + sweep * jnp.arange(frames) / frames
-    axes = [jnp.cos(azimuth) * jnp.cos(elevation), jnp.sin(azimuth) * jnp.cos(elevation)]
-    offset = jnp.stack([*axes, jnp.full(frames, jnp.sin(elevation))], -1)
-    offset = jnp.roll(offset, up - 2, axis=-1) * radius
-    up_axis = jnp.eye(3)[up]
-    cameras = [
-        look_at(jnp.asarray(target) + o, jnp.asarray(target), up=up_axis, focal=focal, width=width, height=height)
-        for o in offset
-    ]
-    return stack_cameras(cameras)
+    above = np.asarray(up, float) / np.linalg.norm(np.asarray(up, float))
+    reference = np.eye(3)[0] if abs(above[0]) < 0.9 else np.eye(3)[2]
+    first = reference - above * (reference @ above)
+    first /= np.linalg.norm(first)
+    azimuth = start + sweep * np.arange(frames) / frames
+    around = np.cos(azimuth)[:, None] * first + np.sin(azimuth)[:, None] * np.cross(above, first)
+    eyes = np.asarray(target) + radius * (np.cos(elevation) * around + np.sin(elevation) * above)
+    look = partial(look_at, target=target, up=above, focal=focal, width=width, height=height)
+    return stack_cameras([look(eye) for eye in eyes])
 
 
 def stack_cameras(cameras: list[Camera]) -> Camera:

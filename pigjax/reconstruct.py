@@ -49,7 +49,7 @@ class FitConfig(eqx.Module):
     scale_regularizer: float = static_field(default=0.002)  # per extent of the points
     evaluate_every: int = static_field(default=500)
     seed: int = static_field(default=0)
-    render: RenderConfig = static_field(default=RenderConfig())  # noqa: RUF009  (frozen)
+    render: RenderConfig = static_field(default=RenderConfig())
 
 
 class Progress(NamedTuple):
@@ -98,18 +98,28 @@ def start_gaussians(
     if len(points) < 4:
         raise InputError(f"points: {len(points)} given; a reconstruction starts from at least 4.")
     rng = np.random.default_rng(seed)
-    pick = np.concatenate([np.arange(min(count, len(points))), rng.integers(len(points), size=max(count - len(points), 0))])
+    pick = np.concatenate(
+        [np.arange(min(count, len(points))), rng.integers(len(points), size=max(count - len(points), 0))]
+    )
     gap = cKDTree(points).query(points, k=4)[0][:, 1:].mean(1)[pick]
     jitter = rng.normal(size=(count, 3)) * 0.5 * gap[:, None] * (np.arange(count) >= len(points))[:, None]
     scale = gap * (len(points) / max(count, len(points))) ** 0.5 * 0.7
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3))
     sh[:, 0] = (rgb[pick] - 0.5) / _DC
     quats = np.tile([1.0, 0, 0, 0], (count, 1))
-    values = points[pick] + jitter, np.log(np.maximum(scale, 1e-6))[:, None].repeat(3, 1), quats, np.full(count, -1.4), sh
+    values = (
+        points[pick] + jitter,
+        np.log(np.maximum(scale, 1e-6))[:, None].repeat(3, 1),
+        quats,
+        np.full(count, -1.4),
+        sh,
+    )
     return Gaussians(*(jnp.asarray(v, jnp.float32) for v in values))
 
 
-def random_points(cameras: Camera, count: int, *, seed: int = 0) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+def random_points(
+    cameras: Camera, count: int, *, seed: int = 0
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Grey points in the ball that the cameras look at, for captures without sparse points. Host."""
     rng = np.random.default_rng(seed)
     position, forward = np.asarray(cameras.position), np.asarray(cameras.world_to_cam)[:, 2, :3]

@@ -1,0 +1,171 @@
+"""The `pigjax` command: arguments in, one clear line and exit code 2 on bad input."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import resources
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from pigjax.errors import InputError, SimulationError
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+_console = Console(stderr=True)
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")]
+
+
+def main() -> None:
+    """Entry point: errors of the input become one line and exit code 2, of the simulation exit code 3."""
+    try:
+        app()
+    except (InputError, SimulationError) as error:
+        _console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
+        sys.exit(2 if isinstance(error, InputError) else 3)
+    except KeyboardInterrupt:
+        _console.print("stopped; run the same command again to go on from the last saved state.")
+        sys.exit(130)
+
+
+@contextmanager
+def _progress(*columns: str) -> Iterator[Progress]:
+    """Progress bar with time left."""
+    texts = [TextColumn(column) for column in ("{task.description:<12}", *columns)]
+    bar = Progress(
+        texts[0], BarColumn(), MofNCompleteColumn(), *texts[1:], TimeElapsedColumn(), TimeRemainingColumn(),
+        console=_console,
+    )  # fmt: skip
+    with bar:
+        yield bar
+
+
+def example_folder() -> Path:
+    """The bundled tabletop scene: in the installed package, or in the checkout of an editable install."""
+    for root in (resources.files("pigjax"), Path(__file__).parents[1]):
+        folder = Path(str(root)) / "examples" / "tabletop"
+        if (folder / "scene.toml").is_file():
+            return folder
+    raise InputError("the bundled example examples/tabletop is missing; install pigjax again.")
+
+
+@app.command()
+def demo(out: Out = Path("pigjax-demo")) -> None:
+    """Simulate the bundled tabletop scene and leave a video."""
+    _run(example_folder() / "scene.toml", out)
+
+
+@app.command()
+def run(scene: Annotated[Path, typer.Argument(help="Scene file (.toml).")], out: Out = Path("out")) -> None:
+    """Simulate a scene and draw its video; a killed run goes on from its last frame."""
+    _run(scene, out)
+
+
+def _run(path: Path, out: Path) -> None:
+    from pigjax.scene import load_scene, run_scene
+
+    scene = load_scene(path)
+    with _progress() as bar:
+        tasks: dict[str, int] = {}
+
+        def tell(stage: str, done: int, of: int) -> None:
+            for other, task in tasks.items():
+                if other != stage:
+                    bar.update(task, completed=bar.tasks[task].total)
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=of)
+            bar.update(tasks[stage], completed=done, total=of)
+
+        report = run_scene(scene, out, progress=tell)
+    table = Table("stage", "run s", "compile s")
+    for name, spent in report.times.items():
+        table.add_row(name, f"{spent.run:.1f}", f"{spent.compile:.1f}")
+    _console.print(table)
+    sizes = report.sizes
+    _console.print(
+        f"{sizes['gaussians']} Gaussians, {sizes['particles']} particles of {', '.join(report.modelled['laws'])};"
+        f" {sizes['frames']} frames of {sizes['substeps_per_frame']} substeps"
+    )
+    for warning in report.warnings:
+        _console.print(f"[yellow]note:[/] {warning}", highlight=False)
+    _console.print(f"video: {report.files['video']}", highlight=False)
+
+
+@app.command()
+def reconstruct(
+    views: Annotated[Path, typer.Argument(help="transforms.json, cameras.json, COLMAP model, or their folder.")],
+    out: Out = Path("reconstruction"),
+    steps: Annotated[int, typer.Option(help="Optimisation steps.", min=1)] = 3000,
+    splats: Annotated[int, typer.Option(help="Number of Gaussians.", min=4)] = 15_000,
+    sh_degree: Annotated[int, typer.Option(help="Bands of view-dependent colour.", min=0, max=3)] = 1,
+    background: Annotated[float, typer.Option(help="Grey level behind the scene: 0 black, 1 white.")] = 0.0,
+    max_size: Annotated[int | None, typer.Option(help="Shrink photos to this many pixels.")] = None,
+    seed: int = 0,
+) -> None:
+    """Fit Gaussians to photos; writes OUT/gaussians.ply, and goes on from OUT/checkpoint if it was stopped."""
+    from pigjax import io
+    from pigjax.reconstruct import FitConfig, reconstruct
+    from pigjax.reconstruct import Progress as Step
+
+    loaded = io.load_views(views, max_size=max_size, background=background)
+    points = io.load_points(loaded.points_path) if loaded.points_path else None
+    config = FitConfig(steps=steps, splats=splats, sh_degree=sh_degree, background=background, seed=seed)
+    out.mkdir(parents=True, exist_ok=True)
+    with _progress("{task.fields[state]}") as bar:
+        task, last = bar.add_task("reconstruct", total=steps, state=""), [""]
+
+        def tell(step: Step) -> None:
+            last[0] = last[0] if step.psnr is None else f"  held-out {step.psnr:.2f} dB"
+            bar.update(task, completed=step.step, state=f"loss {step.loss:.4f}{last[0]}")
+
+        result = reconstruct(loaded, config, points=points, checkpoint=out / "checkpoint", callback=tell)
+    io.save_ply(out / "gaussians.ply", result.gaussians)
+    io.write_json(out / "report.json", {"psnr": result.psnr, "ssim": result.ssim, "mean_psnr": result.mean_psnr,
+                                        "history": [step._asdict() for step in result.history]})  # fmt: skip
+    table = Table("held-out view", "PSNR dB", "SSIM")
+    for name in result.psnr:
+        table.add_row(name, f"{result.psnr[name]:.2f}", f"{result.ssim[name]:.4f}")
+    _console.print(table)
+    _console.print(f"mean PSNR {result.mean_psnr:.2f} dB; {out / 'gaussians.ply'}", highlight=False)
+
+
+@app.command()
+def segment(
+    gaussians: Annotated[Path, typer.Argument(help="Trained .ply.")],
+    views: Annotated[Path, typer.Argument(help="Posed photos with a folder object_mask beside them.")],
+    out: Out = Path("segments"),
+    masks: Annotated[Path | None, typer.Option(help="Folder of masks, if it lies elsewhere.")] = None,
+    names: Annotated[Path | None, typer.Option(help="JSON of mask ids and names.")] = None,
+    tau_t: Annotated[float, typer.Option(help="Transmittance that marks the surface.", min=0, max=1)] = 0.5,
+    tau_d: Annotated[float, typer.Option(help="Relative depth tolerance of a vote.", min=0, max=1)] = 0.03,
+    fill: Annotated[bool, typer.Option(help="Give unseen Gaussians the id of their neighbours.")] = True,
+) -> None:
+    """Lift masks to the Gaussians; writes labels, one .ply per object, and a sheet that shows which id is which."""
+    from pigjax import io
+    from pigjax.scene.objects import segment_files
+
+    cloud = io.load_ply(gaussians)
+    loaded = io.load_views(views, masks=masks if masks is not None else True)
+    known = {} if names is None else {int(k): str(v) for k, v in io.read_json(names).items()}
+    counts = segment_files(cloud, loaded, known, out, tau_T=tau_t, tau_d=tau_d, fill=fill)
+    table = Table("id", "object", "Gaussians")
+    for number, count in counts.items():
+        table.add_row(str(number), known.get(number, "never seen" if number < 0 else ""), str(count))
+    _console.print(table)
+    _console.print(f"written to {out}", highlight=False)
+
+
+@app.command()
+def info(path: Annotated[Path, typer.Argument(help="A .ply, a scene file, or posed photos.")]) -> None:
+    """Say what a file holds."""
+    from pigjax.scene.objects import describe_file
+
+    table = Table(show_header=False)
+    for name, value in describe_file(path).items():
+        table.add_row(name, value)
+    _console.print(table)

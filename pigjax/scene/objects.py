@@ -1,0 +1,118 @@
+"""What `pigjax segment` and `pigjax info` leave and say: objects as files, and files in words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pigjax import io
+from pigjax.errors import MissingFileError
+from pigjax.overlay import id_colours, id_image, legend_sheet, overlay
+from pigjax.scene.schema import load_scene
+from pigjax.segmentation import fill_unseen, lift_masks
+from pigjax.splat import Gaussians, RenderConfig, render, required_capacity, sh_degree_of
+
+_SHEET_VIEWS = 4
+_SH_CONSTANT = 0.28209479177387814
+
+
+def segment_files(
+    gaussians: Gaussians, views: io.Views, names: dict[int, str], out: Path, *, tau_T: float, tau_d: float, fill: bool
+) -> dict[int, int]:
+    """Lift masks and write `labels.npz`, `objects/<id>.ply`, `coloured.ply` and `objects.png`; Gaussians per id. Host.
+
+    Raises:
+        InputError: masks that do not fit the views, or files that cannot be written.
+    """
+    train = views.subset("train") if "train" in views.splits else views
+    assert train.masks is not None
+    num_ids = int(np.max(train.masks)) + 1
+    labels = lift_masks(gaussians, train.cameras, train.masks, num_ids=num_ids, tau_T=tau_T, tau_d=tau_d)
+    if fill:
+        labels = fill_unseen(gaussians, labels)
+    object_id = np.asarray(labels.object_id)
+    (out / "objects").mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(out / "labels.npz", object_id=object_id, votes=labels.votes, confidence=labels.confidence)
+    counts = {int(number): int(np.sum(object_id == number)) for number in np.unique(object_id)}
+    for number in counts:
+        own = np.flatnonzero(object_id == number)
+        stem = "unseen" if number < 0 else f"{number:03d}" + (f"_{names[number]}" if number in names else "")
+        io.save_ply(out / "objects" / f"{stem}.ply", jax.tree.map(lambda values, own=own: values[own], gaussians))
+    colours = id_colours(num_ids)[np.maximum(object_id, 0)] / 255
+    flat = jnp.asarray((colours - 0.5) / _SH_CONSTANT, jnp.float32)[:, None]
+    io.save_ply(out / "coloured.ply", eqx.tree_at(lambda g: g.sh, gaussians, flat))
+    io.write_image(out / "objects.png", _sheet(gaussians, views, object_id, num_ids, names))
+    return counts
+
+
+def _sheet(
+    gaussians: Gaussians, views: io.Views, object_id: np.ndarray, num_ids: int, names: dict[int, str]
+) -> np.ndarray:
+    """A few photos with the lifted objects laid over them, and the legend below."""
+    chosen = np.unique(np.linspace(0, len(views) - 1, _SHEET_VIEWS).astype(int))
+    config = RenderConfig(capacity=required_capacity(gaussians, views.cameras[chosen]))
+    membership = jax.nn.one_hot(object_id, num_ids)
+    tinted, shown = [], []
+    for view in chosen:
+        camera = views.cameras[int(view)]
+        frame = render(gaussians, camera, config, outputs=("object_weights",), object_weights=membership)
+        assert frame.object_weights is not None
+        shown.append(np.asarray(id_image(frame.object_weights)))
+        tinted.append(overlay(views.images[view], shown[-1]))
+    sheet = io.contact_sheet(tinted, columns=2)
+    every = {number: names.get(number, "") for number in np.unique(object_id) if number > 0}
+    legend = legend_sheet(every, image=views.images[chosen[0]], ids=shown[0], width=sheet.shape[1])
+    return np.concatenate([sheet, legend])
+
+
+def describe_file(path: Path) -> dict[str, str]:
+    """What a file holds, in words. Host.
+
+    Raises:
+        MissingFileError: there is no such file.
+        InputError: it is damaged, or of no known kind.
+    """
+    if not path.exists():
+        raise MissingFileError(f"{path}: does not exist; check the path.")
+    if path.suffix == ".ply":
+        return _describe_gaussians(io.read_ply(path, drop_invalid=True))
+    if path.suffix == ".toml":
+        scene = load_scene(path)
+        moving = {name: entry.material or entry.model for name, entry in scene.objects.items() if not entry.fixed}
+        return {
+            "Gaussians": str(scene.path(scene.input.gaussians)),
+            "moving": ", ".join(f"{name} ({material})" for name, material in moving.items()),
+            "fixed": ", ".join(name for name, entry in scene.objects.items() if entry.fixed) or "none",
+            "frames": f"{scene.simulation.frames} at {scene.simulation.fps:g} per second",
+            "grid spacing": f"{scene.simulation.dx:g} m",
+            "clamp": scene.clamp.mode,
+        }
+    cameras, names = io.load_cameras(path)
+    return {
+        "views": f"{len(names)}, {names[0]} to {names[-1]}",
+        "size": f"{cameras.width} x {cameras.height} px",
+        "focal length": f"{float(cameras.focal[0, 0]):.1f} px",
+        "camera positions": _box(np.asarray(cameras.position)),
+    }
+
+
+def _describe_gaussians(read: tuple[Gaussians, int]) -> dict[str, str]:
+    gaussians, dropped = read
+    scales = np.exp(np.asarray(gaussians.log_scales))
+    opacities = np.asarray(jax.nn.sigmoid(gaussians.logit_opacities))
+    return {
+        "Gaussians": f"{len(gaussians)}" + (f" ({dropped} invalid ones left out)" if dropped else ""),
+        "SH degree": str(sh_degree_of(gaussians)),
+        "centres": _box(np.asarray(gaussians.means)),
+        "scale": f"median {np.median(scales):.3g} m, largest {scales.max():.3g} m",
+        "opacity": f"median {np.median(opacities):.2f}, {np.mean(opacities < 1 / 255):.0%} below 1/255",
+    }
+
+
+def _box(points: np.ndarray) -> str:
+    low, high = points.min(0), points.max(0)
+    return "  ".join(f"{axis} {a:.3g} to {b:.3g}" for axis, a, b in zip("xyz", low, high)) + " m"

@@ -1,0 +1,227 @@
+"""From a scene file to what will be simulated and drawn: nothing here that the scene does not ask for."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from pigjax import io
+from pigjax.camera import Camera, orbit, stack_cameras
+from pigjax.clamp import ClampParams
+from pigjax.colliders import Box, Collider, Plane
+from pigjax.errors import SceneError
+from pigjax.materials import Material, MaterialTable
+from pigjax.matter import Particles
+from pigjax.mls_mpm import SimConfig
+from pigjax.particles import Binding, bind, seed_particles
+from pigjax.scene.schema import CameraSpec, Scene, _suggest
+from pigjax.segmentation import Labels, fill_unseen, lift_masks
+from pigjax.solids import collider_from_gaussians
+from pigjax.splat import Gaussians
+
+
+@dataclass
+class Inputs:
+    """Files of a scene, read."""
+
+    gaussians: Gaussians
+    views: io.Views | None
+    ids: dict[str, int]  # id of each object of the scene
+
+
+@dataclass
+class Plan:
+    """What will be simulated."""
+
+    particles: Particles
+    table: MaterialTable
+    binding: Binding | None
+    colliders: tuple[Collider, ...]
+    gravity: Float[np.ndarray, "3"]
+    config: SimConfig
+    clamp: ClampParams
+    frame_dt: float  # [s]
+
+
+def read_inputs(scene: Scene) -> Inputs:
+    """Read Gaussians, views and names.
+
+    Raises:
+        InputError: a file is missing or damaged.
+        SceneError: an object has no id.
+    """
+    spec = scene.input
+    gaussians = io.load_ply(scene.path(spec.gaussians))
+    views = None
+    if spec.views is not None:
+        masks = True if spec.masks is None else scene.path(spec.masks)
+        views = io.load_views(scene.path(spec.views), masks=masks, max_size=spec.max_size)
+    known: dict[str, int] = {}
+    if spec.names is not None:
+        known = {str(name): int(number) for number, name in io.read_json(scene.path(spec.names)).items()}
+    return Inputs(gaussians, views, {name: _id_of(name, scene, known) for name in scene.objects})
+
+
+def _id_of(name: str, scene: Scene, known: dict[str, int]) -> int:
+    own = scene.objects[name].id
+    if own is not None:
+        return own
+    if name not in known:
+        remedy = _suggest(name, known) if known else f"give objects.{name}.id, or input.names"
+        raise SceneError(f"objects.{name}: no object of that name in {scene.input.names or 'input.names'}; {remedy}.")
+    return known[name]
+
+
+def segment(scene: Scene, inputs: Inputs) -> Labels:
+    """Objects of the Gaussians, by the masks; without masks all belong to the only object.
+
+    Raises:
+        SceneError: several objects and no masks, or an object that no Gaussian belongs to.
+    """
+    spec = scene.segmentation
+    if inputs.views is None:
+        if len(inputs.ids) > 1:
+            raise SceneError("input.views is missing: several objects can be told apart by masks only.")
+        (only,) = inputs.ids.values()
+        count = len(inputs.gaussians)
+        return Labels(jnp.full(count, only, jnp.int32), jnp.zeros((count, only + 1), jnp.int32), jnp.ones(count))
+    views = inputs.views.subset("train") if "train" in inputs.views.splits else inputs.views
+    assert views.masks is not None
+    num_ids = max([int(np.max(views.masks)), *inputs.ids.values()]) + 1
+    labels = lift_masks(
+        inputs.gaussians,
+        views.cameras,
+        views.masks,
+        num_ids=num_ids,
+        tau_T=spec.tau_T,
+        tau_d=spec.tau_d,
+        background=spec.background,
+    )
+    if spec.fill_unseen:
+        labels = fill_unseen(inputs.gaussians, labels)
+    found = np.bincount(np.maximum(labels.object_id, 0), minlength=num_ids)
+    for name, number in inputs.ids.items():
+        if found[number] == 0:
+            raise SceneError(f"objects.{name}: no Gaussian has its id {number} in the masks; check input.masks.")
+    return labels
+
+
+def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
+    """Particles, colliders and settings.
+
+    Raises:
+        SceneError: something of the scene cannot be simulated, named by its field.
+    """
+    spec = scene.simulation
+    moving = {name: entry for name, entry in scene.objects.items() if not entry.fixed}
+    materials: dict[int, Material] = {inputs.ids[name]: entry.to_material(name) for name, entry in moving.items()}
+    particles, table = seed_particles(
+        inputs.gaussians,
+        labels,
+        materials,
+        fill=spec.fill,
+        spacing=spec.dx,
+        velocities={inputs.ids[name]: entry.velocity for name, entry in moving.items()},
+        particles_per_cell=spec.particles_per_cell,
+        seed=spec.seed,
+    )
+    binding = bind(inputs.gaussians, labels, particles)
+    gravity = spec.gravity
+    vector = np.array(gravity) if isinstance(gravity, tuple) else -gravity * _axis(scene.input.up)
+    return Plan(
+        particles=particles,
+        table=table,
+        binding=binding if len(binding) else None,
+        colliders=_colliders(scene, inputs, labels),
+        gravity=vector,
+        config=SimConfig(kernel=spec.kernel, cfl=spec.cfl),
+        clamp=ClampParams(
+            scene.clamp.tau_min,
+            scene.clamp.tau_max,
+            scene.clamp.lambda_R,
+            scene.clamp.lambda_S,
+            relative=scene.clamp.relative,
+        ),
+        frame_dt=1 / (spec.fps * spec.slow_motion),
+    )
+
+
+def _colliders(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Collider, ...]:
+    colliders: list[Collider] = []
+    object_id = np.asarray(labels.object_id)
+    for name, entry in scene.objects.items():
+        if entry.fixed:
+            members = np.flatnonzero(object_id == inputs.ids[name])
+            own = jax.tree.map(lambda values, members=members: values[members], inputs.gaussians)
+            colliders.append(
+                collider_from_gaussians(
+                    own, spacing=scene.simulation.dx / 2, friction=entry.friction, name=f"objects.{name}"
+                )
+            )
+    for plane in scene.planes.values():
+        point, normal = jnp.array(plane.point), jnp.array(plane.normal)
+        colliders.append(Plane(point=point, normal=normal, friction=plane.friction, mode=plane.mode))
+    for box in scene.boxes.values():
+        lower, upper = jnp.array(box.lower), jnp.array(box.upper)
+        colliders.append(Box(lower=lower, upper=upper, friction=box.friction, mode=box.mode))
+    return tuple(colliders)
+
+
+def _axis(name: str) -> Float[np.ndarray, "3"]:
+    return np.eye(3)["xyz".index(name[-1])] * (-1 if name.startswith("-") else 1)
+
+
+def make_cameras(scene: Scene, inputs: Inputs, focus: Float[np.ndarray, "3"]) -> Camera:
+    """Batch of one camera for each frame of the video.
+
+    Args:
+        scene: its `camera` section.
+        inputs: its views, for `camera.view`.
+        focus: centre of the orbit where the scene names none [m].
+
+    Raises:
+        SceneError: `camera.view` is not the name of a photo.
+    """
+    spec, frames = scene.camera, scene.simulation.frames + 1
+    if spec.view is not None:
+        return stack_cameras([_camera_of_view(spec, inputs)] * frames)
+    target = np.array(spec.target) if spec.target is not None else focus
+    focal = spec.width / (2 * np.tan(np.radians(spec.field_of_view) / 2))
+    means = np.asarray(inputs.gaussians.means)
+    radius = spec.radius if spec.radius is not None else 2.0 * float(np.median(np.linalg.norm(means - target, axis=1)))
+    return orbit(
+        target,
+        radius=radius,
+        elevation=np.radians(spec.elevation),
+        frames=frames,
+        focal=focal,
+        width=spec.width,
+        height=spec.height,
+        start=np.radians(spec.start),
+        sweep=np.radians(spec.sweep),
+        up=_axis(scene.input.up),
+    )
+
+
+def _camera_of_view(spec: CameraSpec, inputs: Inputs) -> Camera:
+    if inputs.views is None or spec.view not in inputs.views.names:
+        names = () if inputs.views is None else inputs.views.names
+        raise SceneError(f"camera.view = {spec.view!r}: {_suggest(str(spec.view), names)}.")
+    return inputs.views.cameras[inputs.views.names.index(spec.view)].resized(spec.width, spec.height)
+
+
+def signature(scene: Scene) -> str:
+    """Hash of all that the simulated states depend on; the camera, the clamp and the video do not count."""
+    settings: dict[str, Any] = msgspec.to_builtins(scene)
+    for name in ("camera", "clamp", "folder"):
+        settings.pop(name)
+    digest = hashlib.sha256(msgspec.json.encode(settings))
+    digest.update(scene.path(scene.input.gaussians).read_bytes())
+    return digest.hexdigest()[:16]

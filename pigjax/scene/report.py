@@ -1,0 +1,69 @@
+"""What a run says about itself: what was modelled, sizes, times with compilation apart, health and warnings."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax.monitoring
+
+_COMPILE_EVENTS = (
+    "/jax/core/compile/jaxpr_trace_duration",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration",
+    "/jax/core/compile/backend_compile_duration",
+)
+
+
+@dataclass
+class StageTime:
+    """Wall time of one stage of a run [s]."""
+
+    total: float = 0.0
+    compile: float = 0.0  # part of it spent on tracing and compiling
+
+    @property
+    def run(self) -> float:
+        """Without compilation [s]."""
+        return self.total - self.compile
+
+
+@dataclass
+class RunReport:
+    """Result of `run_scene`, written as `report.json`."""
+
+    modelled: dict[str, Any] = field(default_factory=dict)  # what this scene made the program trace
+    sizes: dict[str, Any] = field(default_factory=dict)
+    times: dict[str, StageTime] = field(default_factory=dict)
+    health: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    files: dict[str, str] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time spent inside to a stage."""
+        spent = self.times.setdefault(name, StageTime())
+        compiling = [0.0]
+
+        def listen(event: str, seconds: float, **_: Any) -> None:
+            if event in _COMPILE_EVENTS:
+                compiling[0] += seconds
+
+        jax.monitoring.register_event_duration_secs_listener(listen)
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            jax.monitoring.unregister_event_duration_listener(listen)
+            spent.total += time.perf_counter() - begun
+            spent.compile += compiling[0]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        times = {
+            name: {"run_s": round(t.run, 3), "compile_s": round(t.compile, 3), "total_s": round(t.total, 3)}
+            for name, t in self.times.items()
+        }
+        return {**vars(self), "times": times}

@@ -1,0 +1,251 @@
+"""Running a scene: segment, simulate, draw. States are saved frame by frame, so that a killed run goes on."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pigjax import io
+from pigjax.camera import Camera
+from pigjax.errors import SimulationError
+from pigjax.matter import Grid, Health, Particles, fit_grid
+from pigjax.mls_mpm import choose_substeps, rollout
+from pigjax.overlay import id_image, legend_sheet, overlay
+from pigjax.particles import deform
+from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, segment, signature
+from pigjax.scene.report import RunReport
+from pigjax.scene.schema import Scene
+from pigjax.segmentation import Labels
+from pigjax.splat import RenderConfig, render, required_capacity
+
+_MOST_NODES = 200_000_000
+_SHEET_FRAMES = 12
+Progress = Callable[[str, int, int], None]  # stage, done, of
+
+
+def run_scene(scene: Scene, out_dir: str | os.PathLike[str], *, progress: Progress | None = None) -> RunReport:
+    """Simulate a scene and draw its video. Host.
+
+    Into `out_dir` go `video.mp4`, `contact_sheet.png`, `objects.png` (the objects in their colours), `labels.npz`,
+    `states/<frame>.npz` (x, v and F_visual of every particle) and `report.json`. A run that was killed goes on from its
+    last state; when all states are there, only the video is drawn anew.
+
+    Args:
+        scene: as `load_scene` gives it.
+        out_dir: folder for the results, made if it is missing.
+        progress: told each stage, frames done and frames to do.
+
+    Raises:
+        InputError: a file is missing or damaged, the scene asks for something that cannot be, or the states in
+            `out_dir` belong to another scene.
+        SimulationError: the simulation broke down; states up to the last good frame are kept.
+    """
+    out = Path(out_dir)
+    out.mkdir(parents=True, exist_ok=True)
+    report = RunReport()
+    tell = progress or (lambda stage, done, of: None)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            _run(scene, out, report, tell)
+        finally:
+            report.warnings += list(dict.fromkeys(str(w.message) for w in caught))
+            io.write_json(out / "report.json", report.as_dict())
+    return report
+
+
+def _run(scene: Scene, out: Path, report: RunReport, tell: Progress) -> None:
+    with report.stage("read"):
+        inputs = read_inputs(scene)
+        key = signature(scene)
+    with report.stage("segment"):
+        tell("segment", 0, 1)
+        labels = segment(scene, inputs)
+        np.savez_compressed(out / "labels.npz", object_id=labels.object_id, confidence=labels.confidence)
+    with report.stage("seed"):
+        tell("seed", 0, 1)
+        plan = make_plan(scene, inputs, labels)
+    _describe(scene, inputs, plan, labels, report)
+    with report.stage("simulate"):
+        _simulate(scene, plan, out / "states", key, report, tell)
+    with report.stage("draw"):
+        _draw(scene, inputs, plan, labels, out, key, report, tell)
+
+
+def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: RunReport) -> None:
+    names = {number: name for name, number in inputs.ids.items()}
+    object_id, counts = np.asarray(labels.object_id), dict(zip(plan.table.laws, plan.particles.counts))
+    report.modelled |= {
+        "laws": sorted(set(plan.table.laws)),
+        "colliders": [type(c).__name__ for c in plan.colliders],
+        "kernel": plan.config.kernel,
+        "clamp": scene.clamp.mode,
+        "sh_coefficients": inputs.gaussians.sh.shape[1],
+    }
+    report.sizes |= {
+        "gaussians": len(inputs.gaussians),
+        "gaussians_of": {names.get(k, str(k)): int(np.sum(object_id == k)) for k in np.unique(object_id)},
+        "particles": len(plan.particles),
+        "particles_of_law": counts,
+        "gaussians_without_particle": 0 if plan.binding is None else len(plan.binding),
+        "frames": scene.simulation.frames,
+        "mass_kg": float(plan.particles.mass.sum()),
+    }
+
+
+def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunReport, tell: Progress) -> None:
+    """Simulate what is not on disk yet, one rollout per frame on a grid that is fitted anew."""
+    frames, particles = scene.simulation.frames, plan.particles
+    done = io.last_state(folder, signature=key) if folder.exists() else None
+    checkpoint = folder / "last.ckpt"
+    if done is None:
+        done = 0
+        _save(folder, 0, particles, key, checkpoint)
+    elif done < frames:
+        saved, particles = io.load_pytree(checkpoint, (np.zeros((), np.int64), particles))
+        done = int(saved)
+    dx = scene.simulation.dx
+    substeps = choose_substeps(
+        particles,
+        fit_grid(particles.x, dx),
+        plan.table,
+        plan.config,
+        frames=max(frames - done, 1),
+        frame_dt=plan.frame_dt,
+        gravity=plan.gravity,
+        colliders=plan.colliders,
+    )
+    config = replace(plan.config, substeps=substeps)
+    worst: list[Health] = []
+    shape = None
+    for frame in range(done + 1, frames + 1):
+        tell("simulate", frame - 1, frames)
+        particles, health, shape = _one_frame(particles, plan, config, dx)
+        worst.append(health)
+        if health.nonfinite > 0 or health.max_courant >= 1:
+            raise SimulationError(
+                f"frame {frame} of {frames}: {', '.join(health.problems())}; states up to frame {frame - 1} are kept in"
+                f" {folder}. Lower simulation.cfl, or make matter softer or slower."
+            )
+        _save(folder, frame, particles, key, checkpoint)
+    tell("simulate", frames, frames)
+    report.sizes |= {"substeps_per_frame": substeps, "last_grid": shape, "resumed_from_frame": done}
+    if worst:
+        report.health |= {
+            "min_J": float(min(h.min_J for h in worst)),
+            "max_courant": float(max(h.max_courant for h in worst)),
+            "inverted_at_most": int(max(h.inverted for h in worst)),
+            "nonfinite": int(max(h.nonfinite for h in worst)),
+        }
+        if report.health["inverted_at_most"]:
+            report.warnings.append(
+                f"up to {report.health['inverted_at_most']} particles were turned inside out at one time;"
+                " stiffer matter or a finer simulation.dx would prevent it."
+            )
+
+
+def _save(folder: Path, frame: int, particles: Particles, key: str, checkpoint: Path) -> None:
+    arrays = {"x": particles.x, "v": particles.v, "F_visual": particles.F_visual}
+    io.save_state(folder, frame, {name: np.asarray(a) for name, a in arrays.items()}, signature=key)
+    io.save_pytree(checkpoint, (np.asarray(frame), particles))
+
+
+def _one_frame(particles: Particles, plan: Plan, config, dx: float) -> tuple[Particles, Health, tuple[int, int, int]]:
+    """One frame on a grid around where matter is and is heading; a wall that was met means a larger grid."""
+    slack = 2.0
+    while True:
+        grid = _grid_ahead(particles, plan, dx, slack)
+        moved, _, health = rollout(
+            particles,
+            grid,
+            plan.table,
+            config,
+            frames=1,
+            frame_dt=plan.frame_dt,
+            gravity=jnp.asarray(plan.gravity, particles.x.dtype),
+            colliders=plan.colliders,
+        )
+        if health.escaped == 0:
+            return moved, health, grid.shape
+        slack *= 2
+
+
+def _grid_ahead(particles: Particles, plan: Plan, dx: float, slack: float) -> Grid:
+    x, v = np.asarray(particles.x), np.asarray(particles.v)
+    ahead = x + v * plan.frame_dt + 0.5 * plan.gravity * plan.frame_dt**2
+    grid = fit_grid(np.concatenate([x, ahead]).astype(x.dtype), dx, margin=slack * dx)
+    if (nodes := int(np.prod(grid.shape))) > _MOST_NODES:
+        raise SimulationError(
+            f"matter has spread so far that its grid needs {nodes:.2g} nodes (at most {_MOST_NODES:.2g});"
+            " catch what falls with a plane, or raise simulation.dx."
+        )
+    return grid
+
+
+def _draw(
+    scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, out: Path, key: str, report: RunReport, tell: Progress
+) -> None:
+    """Pose and render each saved state."""
+    frames, gaussians = scene.simulation.frames, inputs.gaussians
+    focus = np.asarray(plan.particles.x).mean(0)
+    cameras = make_cameras(scene, inputs, focus)
+    background = jnp.asarray(scene.camera.background)
+    capacity = int(1.5 * required_capacity(gaussians, cameras))
+
+    def pose_and_render(capacity: int, x, F_visual, camera: Camera):
+        particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, (x, F_visual))
+        splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=plan.binding)
+        frame = render(splats, camera, RenderConfig(capacity=capacity), background=background, outputs=("rgb",))
+        return jnp.clip(frame.rgb, 0, 1), frame.overflow
+
+    draw = jax.jit(pose_and_render, static_argnums=0)
+    sheet_frames = np.unique(np.linspace(0, frames, _SHEET_FRAMES).round().astype(int))
+    sheet: list[np.ndarray] = []
+
+    def pictures() -> Iterator[np.ndarray]:
+        nonlocal capacity
+        for frame in range(frames + 1):
+            tell("draw", frame, frames + 1)
+            state = io.load_state(out / "states", frame, signature=key)
+            rgb, overflow = draw(capacity, state["x"], state["F_visual"], cameras[frame])
+            while overflow > 0:
+                capacity = int(1.5 * (capacity + overflow))
+                rgb, overflow = draw(capacity, state["x"], state["F_visual"], cameras[frame])
+            picture = np.asarray(rgb)
+            if frame in sheet_frames:
+                sheet.append(picture)
+            yield picture
+
+    io.write_video(out / "video.mp4", pictures(), fps=scene.simulation.fps)
+    tell("draw", frames + 1, frames + 1)
+    io.write_image(out / "contact_sheet.png", io.contact_sheet(sheet))
+    _draw_objects(inputs, labels, cameras[0], background, sheet[0], out / "objects.png")
+    for name in ("video.mp4", "contact_sheet.png", "objects.png", "labels.npz", "states", "report.json"):
+        report.files[name.split(".")[0]] = str(out / name)
+
+
+def _draw_objects(
+    inputs: Inputs, labels: Labels, camera: Camera, background: Any, image: np.ndarray, path: Path
+) -> None:
+    """The first frame with its objects tinted, and the legend below."""
+    count = int(np.max(labels.object_id)) + 1
+    membership = jax.nn.one_hot(labels.object_id, count)
+    config = RenderConfig(capacity=required_capacity(inputs.gaussians, camera))
+    frame = render(
+        inputs.gaussians, camera, config, outputs=("object_weights",), object_weights=membership, background=background
+    )
+    assert frame.object_weights is not None
+    ids = id_image(frame.object_weights)
+    names = {number: name for name, number in inputs.ids.items()}
+    tinted = overlay(image, ids)
+    legend = legend_sheet(names, image=image, ids=ids, width=tinted.shape[1])
+    io.write_image(path, np.concatenate([tinted, legend]))

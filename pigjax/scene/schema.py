@@ -1,0 +1,244 @@
+"""The scene file: what it may say, decoded and checked by msgspec, every error named by field, value and remedy."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+from msgspec import Struct
+
+from pigjax.errors import InputError, MissingFileError, SceneError
+from pigjax.materials import PRESETS, Material
+
+Triple = tuple[float, float, float]
+_NUMBERS = (
+    "density", "young", "poisson", "yield_stress", "hardening_modulus", "residual_stress", "friction_angle", "cohesion",
+    "bulk_modulus", "viscosity",
+)  # fmt: skip
+
+
+class InputSpec(Struct, forbid_unknown_fields=True, frozen=True):
+    """Where the scene comes from; paths are relative to the scene file."""
+
+    gaussians: str  # trained .ply
+    views: str | None = None  # posed photos, which the masks belong to
+    masks: str | None = None  # folder of instance masks; None: `object_mask` beside the photos
+    names: str | None = None  # JSON of mask ids and names
+    max_size: int | None = None  # [px]
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"  # axis of the world that points up
+
+
+class SegmentationSpec(Struct, forbid_unknown_fields=True, frozen=True):
+    """Thresholds of the vote (paper 3.2)."""
+
+    tau_T: float = 0.5
+    tau_d: float = 0.03
+    background: Literal["ignore", "vote"] = "ignore"
+    fill_unseen: bool = True  # unseen Gaussians take the id of their neighbours
+
+
+class SimulationSpec(Struct, forbid_unknown_fields=True, frozen=True):
+    """The simulation, in SI units."""
+
+    dx: float  # grid spacing [m]
+    frames: int = 48
+    fps: float = 24.0
+    gravity: float | Triple = 9.81  # downwards, or a vector [m/s²]
+    slow_motion: float = 1.0  # simulated time is shown this many times slower
+    particles_per_cell: float = 8.0
+    fill: bool = True  # fill objects inside
+    cfl: float = 0.4
+    kernel: str = "quadratic"
+    seed: int = 0
+
+
+class ClampSpec(Struct, forbid_unknown_fields=True, frozen=True):
+    """The adaptive eigen-clamp (paper 3.3)."""
+
+    mode: Literal["aligned", "literal", "covariance", "fixed"] = "aligned"
+    tau_min: float = 0.5
+    tau_max: float = 2.0
+    lambda_R: float = 1.2
+    lambda_S: float = 0.8
+    relative: bool = True
+
+
+class CameraSpec(Struct, forbid_unknown_fields=True, frozen=True):
+    """From where the video is drawn: a view of the capture, or an orbit."""
+
+    view: str | None = None  # name of a photo whose camera is taken
+    target: Triple | None = None  # centre of the orbit [m]; None: middle of the moving objects
+    radius: float | None = None  # [m]
+    elevation: float = 30.0  # [degrees]
+    start: float = 0.0  # azimuth of the first frame [degrees]
+    sweep: float = 0.0  # azimuth covered by the video [degrees]
+    field_of_view: float = 45.0  # horizontal [degrees]
+    width: int = 512  # [px]
+    height: int = 512
+    background: float | Triple = 0.0
+
+
+class ObjectSpec(Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """One object: its material by preset, by law and numbers, or a preset with some numbers changed."""
+
+    id: int | None = None  # id in the masks; None: looked up by the object's name
+    fixed: bool = False  # a still collider made from its own splats
+    friction: float = 0.5  # Coulomb's coefficient of a fixed object
+    material: str | None = None
+    model: str | None = None
+    velocity: Triple = (0.0, 0.0, 0.0)  # [m/s]
+    density: float | None = None
+    young: float | None = None
+    poisson: float | None = None
+    yield_stress: float | None = None
+    hardening_modulus: float | None = None
+    residual_stress: float | None = None
+    friction_angle: float | None = None  # [rad]
+    cohesion: float | None = None
+    bulk_modulus: float | None = None
+    viscosity: float | None = None
+
+    def to_material(self, name: str) -> Material:
+        """The material that it says.
+
+        Raises:
+            SceneError: no material, an unknown one, or numbers out of range.
+        """
+        if (self.material is None) == (self.model is None):
+            raise SceneError(f"objects.{name}: give either material (a preset) or model (a law with its numbers).")
+        if self.material is not None and self.material not in PRESETS:
+            raise SceneError(f"objects.{name}.material = {self.material!r}: {_suggest(self.material, PRESETS)}.")
+        settings: dict[str, Any] = dict(PRESETS[self.material]) if self.material else {"model": self.model}
+        settings |= {key: value for key in _NUMBERS if (value := getattr(self, key)) is not None}
+        if "density" not in settings:
+            raise SceneError(f"objects.{name}.density is missing: give it in kg/m³.")
+        try:
+            return Material(**settings)
+        except InputError as error:
+            raise SceneError(f"objects.{name}.{error}") from None
+
+
+class PlaneSpec(Struct, forbid_unknown_fields=True, frozen=True):
+    """A half space that matter cannot enter."""
+
+    point: Triple  # [m]
+    normal: Triple
+    friction: float = 0.5
+    mode: Literal["sticky", "slip", "separate"] = "separate"
+
+
+class BoxSpec(Struct, forbid_unknown_fields=True, frozen=True):
+    """A solid box along the axes."""
+
+    lower: Triple  # [m]
+    upper: Triple
+    friction: float = 0.5
+    mode: Literal["sticky", "slip", "separate"] = "separate"
+
+
+class Scene(Struct, forbid_unknown_fields=True, frozen=True):
+    """A whole scene file."""
+
+    input: InputSpec
+    simulation: SimulationSpec
+    objects: dict[str, ObjectSpec]
+    segmentation: SegmentationSpec = SegmentationSpec()
+    clamp: ClampSpec = ClampSpec()
+    camera: CameraSpec = CameraSpec()
+    planes: dict[str, PlaneSpec] = {}
+    boxes: dict[str, BoxSpec] = {}
+    folder: str = "."  # set by `load_scene`; what relative paths start from
+
+    def path(self, name: str) -> Path:
+        """A path of the file, seen from the working directory."""
+        return Path(self.folder) / name
+
+
+def load_scene(path: str | Path) -> Scene:
+    """Read and check a scene file. Host.
+
+    Raises:
+        MissingFileError: there is no such file.
+        SceneError: it is not TOML, a field is unknown (the nearest right name is told), has the wrong type, or a value
+            is out of range.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MissingFileError(f"{path}: scene file does not exist; check the path.")
+    try:
+        values = tomllib.loads(path.read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path}: not valid TOML: {error}.") from None
+    return scene_from(values, folder=path.parent, where=str(path))
+
+
+def scene_from(values: dict[str, Any], *, folder: str | Path = ".", where: str = "scene") -> Scene:
+    """A scene from plain values, as TOML gives them, checked.
+
+    Raises:
+        SceneError: as `load_scene`.
+    """
+    try:
+        scene = msgspec.convert({**values, "folder": str(folder)}, Scene)
+    except msgspec.ValidationError as error:
+        raise SceneError(f"{where}: {_explain(str(error), values)}") from None
+    _check(scene, where)
+    return scene
+
+
+def _check(scene: Scene, where: str) -> None:
+    positive = {
+        "simulation.dx": scene.simulation.dx,
+        "simulation.frames": scene.simulation.frames,
+        "simulation.fps": scene.simulation.fps,
+        "simulation.slow_motion": scene.simulation.slow_motion,
+        "simulation.particles_per_cell": scene.simulation.particles_per_cell,
+        "simulation.cfl": scene.simulation.cfl,
+        "camera.width": scene.camera.width,
+        "camera.height": scene.camera.height,
+        "camera.field_of_view": scene.camera.field_of_view,
+    }
+    for name, value in positive.items():
+        if not 0 < value < float("inf"):
+            raise SceneError(f"{where}: {name} = {value}: it must be > 0.")
+    moving = [name for name, spec in scene.objects.items() if not spec.fixed]
+    if not moving:
+        raise SceneError(f"{where}: objects: none moves; give at least one a material.")
+    for name in moving:
+        scene.objects[name].to_material(name)
+    for name, spec in scene.objects.items():
+        if spec.fixed and (spec.material or spec.model):
+            raise SceneError(f"{where}: objects.{name}: a fixed object has no material; remove one of the two.")
+
+
+def _explain(message: str, values: dict[str, Any]) -> str:
+    """msgspec's message with the place first and, for an unknown field, the nearest right name."""
+    place = re.search(r" - at `(key in )?\$\.?([^`]*)`$", message)
+    at = place.group(2).replace("[...]", "") if place else ""
+    message = re.sub(r" - at `.*`$", "", message)
+    unknown = re.search(r"unknown field `([^`]*)`", message)
+    if unknown is None:
+        return f"{at or 'top level'}: {message[0].lower()}{message[1:]}."
+    name = unknown.group(1)
+    known = _fields_at(at)
+    if at.split(".")[0] in ("objects", "planes", "boxes"):
+        table = values.get(at.split(".")[0], {})
+        at = next((f"{at}.{key}" for key, entry in table.items() if isinstance(entry, dict) and name in entry), at)
+    return f"{at + '.' if at else ''}{name}: unknown field; {_suggest(name, known)}."
+
+
+def _fields_at(place: str) -> tuple[str, ...]:
+    structs = {"": Scene, "objects": ObjectSpec, "planes": PlaneSpec, "boxes": BoxSpec}
+    structs |= {"input": InputSpec, "segmentation": SegmentationSpec, "simulation": SimulationSpec}
+    structs |= {"clamp": ClampSpec, "camera": CameraSpec}
+    fields = structs.get(place.split(".")[0], Scene).__struct_fields__
+    return tuple(name for name in fields if name != "folder")
+
+
+def _suggest(name: str, known) -> str:
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(known)}"

@@ -1,0 +1,92 @@
+"""The house stands as DESIGN says: imports point down only, importing is cheap and changes nothing."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "pigjax"
+
+# every module may import what stands on a lower floor only
+FLOORS = [
+    {"errors", "arrays"},
+    {"linalg", "metrics"},
+    {"camera", "materials"},
+    {"tiles", "colliders", "transfers"},
+    {"splat", "matter"},
+    {"tile_walks", "clamp", "shells", "relocation", "overlay", "mls_mpm", "io"},
+    {"filling"},
+    {"segmentation", "particles", "solids", "reconstruct"},
+    {"scene"},
+    {"cli"},
+]
+FLOOR_OF = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
+# the two worlds meet in particles.py and solids.py only
+SPLATS = {"splat", "tiles", "tile_walks", "clamp", "segmentation", "relocation", "reconstruct", "filling", "shells"}
+MATTER = {"matter", "mls_mpm", "transfers", "materials", "colliders"}
+
+
+def imports_of(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "pigjax":
+            parts = node.module.split(".")
+            yield from [parts[1]] if len(parts) > 1 else [alias.name for alias in node.names]
+        elif isinstance(node, ast.Import):
+            yield from (alias.name.split(".")[1] for alias in node.names if alias.name.startswith("pigjax."))
+
+
+MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
+
+
+def room(path):
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_point_down(path):
+    here = room(path)
+    for other in set(imports_of(path)) - {here}:
+        assert FLOOR_OF[other] < FLOOR_OF[here], f"{here} must not import {other}"
+        assert not (here in SPLATS and other in MATTER), f"{here} is of the splats, {other} of matter"
+        assert not (here in MATTER and other in SPLATS), f"{here} is of matter, {other} of the splats"
+
+
+def test_only_io_opens_files_for_users():
+    for path in MODULES:
+        if room(path) in ("io", "scene", "cli"):
+            continue
+        calls = {node.func.id for node in ast.walk(ast.parse(path.read_text()))
+                 if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
+        assert "open" not in calls, path
+
+
+def test_modules_are_short():
+    for path in MODULES:
+        assert len(path.read_text().splitlines()) <= 420, f"{path.name}: one idea each, about 400 lines"
+
+
+def test_import_is_fast_and_changes_no_configuration():
+    code = """
+import time, jax, jax.numpy
+before, begun = dict(jax.config.values), time.process_time()
+import pigjax
+spent = time.process_time() - begun
+assert before.items() <= dict(jax.config.values).items(), "jax.config changed"
+print(spent)
+"""
+    # processor time of the best of three: the machine may be busy with other things
+    spent = [
+        float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
+        for _ in range(3)
+    ]
+    print(f"import pigjax beyond jax: {min(spent):.2f} s")
+    assert min(spent) < 1.5
+
+
+def test_every_public_name_has_a_docstring():
+    import pigjax
+
+    missing = [name for name in pigjax.__all__ if not (getattr(pigjax, name).__doc__ or "").strip()]
+    assert missing == []
