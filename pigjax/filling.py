@@ -90,6 +90,8 @@ def lattice_cells(
     Raises:
         InputError: there would be more than `max_particles` cells.
     """
+    if solid.volume == 0:
+        return np.zeros((0, 3)), np.zeros(0)
     if solid.volume > max_particles * step**3:
         raise InputError(
             f"{name}: {solid.volume / step**3:.3g} particles at {step:.3g} m exceed {max_particles}; coarsen spacing."
@@ -108,11 +110,11 @@ def lattice_cells(
         voxels = np.floor((solid.low + (corners + 0.5) * step - solid.origin) / solid.voxel).astype(int)
         corners = corners[touched[tuple(np.clip(voxels, 0, np.array(touched.shape) - 1).T)]]
         probes = solid.low + (corners[:, None] + offsets) * step
-        shares = solid.share(probes.reshape(-1, 3)).reshape(len(corners), -1).mean(1)
+        shares = solid.share(probes.reshape(-1, 3)).reshape(-1, len(offsets)).mean(1)
         full = shares > _LEAST_SHARE
         slabs.append((corners[full], shares[full]))
     corners, shares = (np.concatenate(column) for column in zip(*slabs))
-    return solid.low + (corners + 0.5) * step, shares * (solid.volume / max(shares.sum(), 1e-30))
+    return solid.low + (corners + 0.5) * step, shares * (solid.volume / max(shares.sum(), _LEAST_SHARE))
 
 
 def jittered(
