@@ -13,6 +13,7 @@ from dense import dense_render
 from pigjax.camera import Camera, look_at, stack_cameras
 from pigjax.errors import InputError
 from pigjax.io import load_views
+from pigjax.overlay import id_colours, id_image, legend_sheet, overlay
 from pigjax.segmentation import Labels, fill_unseen, lift_masks, object_mask
 from pigjax.splat import Gaussians, RenderConfig, render
 
@@ -345,3 +346,33 @@ def test_tabletop_gaussians_get_their_true_ids_from_eight_views():
     assert right > 0.97
     filled = np.mean(np.asarray(fill_unseen(gaussians, labels).object_id) == truth)
     assert filled > 0.985
+
+
+def test_overlay_tints_objects_only_and_ids_have_their_own_colours():
+    colours = id_colours(64)
+    assert len(np.unique(colours, axis=0)) == 64
+    image, ids = np.full((6, 6, 3), 100, np.uint8), np.zeros((6, 6), int)
+    ids[1:5, 1:5] = 3
+    plain = overlay(image, ids, 0.25, outline=False)
+    np.testing.assert_array_equal(plain[ids == 0], 100)
+    np.testing.assert_array_equal(plain[2, 2], np.round(75 + 0.25 * colours[3].astype(float)))
+    outlined = overlay(image / 255, ids, 0.25)
+    np.testing.assert_array_equal(outlined[1, 1], colours[3])
+    np.testing.assert_array_equal(outlined[2, 2], plain[2, 2])
+    with pytest.raises(InputError, match="ids have size"):
+        overlay(image, ids[:3])
+
+
+def test_id_image_is_the_largest_share_where_anything_is_seen():
+    weights = jnp.array([[[0.0, 0.6, 0.3], [0.0, 0.2, 0.2], [0.0, 0.1, 0.8]]])
+    np.testing.assert_array_equal(id_image(weights), [[1, 0, 2]])
+
+
+def test_legend_sheet_has_a_row_per_name_in_its_colour():
+    image, ids = np.full((8, 8, 3), 40, np.uint8), np.zeros((8, 8), int)
+    ids[2:5, 2:7] = 1
+    sheet = legend_sheet({2: "mug", 1: "duck"}, image=image, ids=ids, row_height=48)
+    assert sheet.shape == (96, 320, 3)
+    np.testing.assert_array_equal(sheet[24, 24], id_colours(3)[1])
+    np.testing.assert_array_equal(sheet[72, 24], id_colours(3)[2])
+    np.testing.assert_array_equal(sheet[24, 72], [40, 40, 40])
