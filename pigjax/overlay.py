@@ -31,7 +31,7 @@ def id_image(object_weights: Float[Array, "*b h w m"], threshold: float = 0.5) -
 
 def overlay(
     image: Num[Array | np.ndarray, "h w 3"],
-    ids: Integer[Array | np.ndarray, "h w"],
+    ids: Integer[Array | np.ndarray, "rows columns"],
     alpha: float = 0.5,
     *,
     outline: bool = True,
