@@ -33,7 +33,9 @@ class Particles(eqx.Module):
     material: Int[Array, "p"] = array_field()  # row of the material table
     hardening: Float[Array, "p"] = array_field()  # internal variable of the plastic laws
     gaussian: Int[Array, "p"] = array_field()  # index of the Gaussian it carries, -1 for none
-    counts: tuple[int, ...] = static_field()  # particles of each row: what sizes the groups that the laws are traced for
+    counts: tuple[int, ...] = (
+        static_field()
+    )  # particles of each row: what sizes the groups that the laws are traced for
 
     def __len__(self) -> int:
         return self.x.shape[0]

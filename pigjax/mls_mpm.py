@@ -30,7 +30,7 @@ from pigjax.transfers import KERNELS, gather, scatter, stage, stencil
 Vector = Float[Array, "3"] | Sequence[float | int] | np.ndarray
 _WALLS = ("separate", "slip", "sticky")
 _INTEGRATORS = ("explicit",)
-_CACHED = 4096  # particles of a chunk on a CPU: their windows fit its second-level cache
+_CACHED = 2048  # particles of a chunk on a CPU: their windows fit its second-level cache
 
 
 class SimConfig(eqx.Module):
@@ -46,7 +46,7 @@ class SimConfig(eqx.Module):
     cfl: float = static_field(default=0.4)  # share of a cell that waves and particles cross in a step
     walls: str = static_field(default="separate")  # of the domain: "separate", "slip" or "sticky"
     visual_stretch: tuple[float, float] = static_field(default=(0.2, 5.0))  # bounds of F_visual's singular values
-    chunk: int | None = static_field(default=None)  # particles handled at once; None: 4096 on a CPU, else all
+    chunk: int | None = static_field(default=None)  # particles handled at once; None: 2048 on a CPU, else all
     force: bool = static_field(default=False)  # run steps longer than the stable limit
 
     def __check_init__(self):
@@ -394,9 +394,7 @@ def _prepare(particles, grid, table, config, dt, gravity, colliders):
 
     ends = np.cumsum([sizes[law] for law in laws])
     sorted_particles = particles if order is None else _reorder(particles, order)
-    parts = [
-        jax.tree.map(lambda a: a[end - sizes[law] : end], sorted_particles) for law, end in zip(laws, ends)
-    ]
+    parts = [jax.tree.map(lambda a: a[end - sizes[law] : end], sorted_particles) for law, end in zip(laws, ends)]
     groups, states, frozen = [], [], None
     for law, part in zip(laws, parts):
         if LAWS[law].respond is None:
@@ -466,7 +464,16 @@ def _ungroup(part, state):
 
     x, v, C, F, _, hardening, visual = (None if leaf is None else flat(leaf) for leaf in state)
     return Particles(
-        x, v, F, C, F if visual is None else visual, part.volume0, part.mass, part.material, hardening, part.gaussian,
+        x,
+        v,
+        F,
+        C,
+        F if visual is None else visual,
+        part.volume0,
+        part.mass,
+        part.material,
+        hardening,
+        part.gaussian,
         part.counts,
     )
 

@@ -91,9 +91,7 @@ def scatter(
         rows = [at_zero[i] + sum(affine[i, k] * axes[k] for k in range(3)) for i in range(3)]
         return jnp.stack([at.weights * mass, *(at.weights * row for row in rows)], 3)
 
-    return lax.scatter_add(
-        nodes, at.first, stage(go, updates, at, mass, momentum, affine), _SCATTER, mode=_IN_BOUNDS
-    )
+    return lax.scatter_add(nodes, at.first, stage(go, updates, at, mass, momentum, affine), _SCATTER, mode=_IN_BOUNDS)
 
 
 def gather(
@@ -105,14 +103,17 @@ def gather(
         width = len(kernel.offsets)
         return lax.gather(velocity, first, _GATHER, (width, width, width, 3), mode=_IN_BOUNDS)
 
-    def moments(values, at):
-        weighted = at.weights[:, :, :, None] * values
-        mean = weighted.sum((0, 1, 2))
-        axes = _offset_axes(kernel, values.dtype)
-        first = jnp.stack([(weighted * axes[k][..., None]).sum((0, 1, 2)) for k in range(3)], 1)
-        return mean, kernel.inverse_inertia * (first - mean[:, None] * at.distance)
+    def moments(weighted, distance):
+        rest, first = weighted, []
+        for _ in range(3):
+            moment = sum(offset * plane for offset, plane in zip(kernel.offsets, rest))
+            first.append(moment.sum(range(moment.ndim - 2)))
+            rest = sum(rest)
+        return rest, kernel.inverse_inertia * (jnp.stack(first, 1) - rest[:, None] * distance)
 
-    return stage(go, moments, stage(go, window, velocity, at.first), at)
+    values = stage(go, window, velocity, at.first)
+    weighted = stage(go, lambda values, weights: values * weights[:, :, :, None], values, at.weights)
+    return stage(go, moments, weighted, at.distance)
 
 
 def _offset_axes(kernel: Kernel, dtype) -> list[np.ndarray]:

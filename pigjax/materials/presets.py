@@ -12,9 +12,7 @@ from pigjax.materials.table import Material
 PRESETS = {
     "jelly": dict(model="fixed_corotated", density=1000.0, young=2e4, poisson=0.4),
     "rubber": dict(model="neo_hookean", density=1100.0, young=5e5, poisson=0.45),
-    "metal": dict(
-        model="von_mises", density=2700.0, young=5e6, poisson=0.33, yield_stress=1e5, hardening_modulus=5e4
-    ),
+    "metal": dict(model="von_mises", density=2700.0, young=5e6, poisson=0.33, yield_stress=1e5, hardening_modulus=5e4),
     "plasticine": dict(
         model="plasticine",
         density=1500.0,

@@ -18,7 +18,9 @@ from pigjax.materials.laws import law_of
 
 def _number(**kwargs):
     """A number that a user may sweep: always an array, so that a new value never recompiles."""
-    return eqx.field(converter=lambda v: jnp.asarray(v, float) if isinstance(v, int | float) else as_array(v), kw_only=True, **kwargs)
+    return eqx.field(
+        converter=lambda v: jnp.asarray(v, float) if isinstance(v, int | float) else as_array(v), kw_only=True, **kwargs
+    )
 
 
 class Parameters(eqx.Module):
