@@ -291,9 +291,9 @@ def _turn(a, b, tan, exchange):
 def _length_and_direction(vector, noise, fallback):
     """Length and unit direction along axis 0, or zero and the fallback where the square is noise or underflows."""
     squared = _dot(vector, vector)
-    positive = squared > jnp.maximum(noise, jnp.finfo(vector.dtype).tiny / jnp.finfo(vector.dtype).eps)
-    length = jnp.where(positive, jnp.sqrt(squared), 0.0)
-    return length, jnp.where(positive, vector / jnp.where(positive, length, 1.0), fallback)
+    vanishing = squared <= jnp.maximum(noise, jnp.finfo(vector.dtype).tiny / jnp.finfo(vector.dtype).eps)
+    length = jnp.where(vanishing, 0.0, jnp.sqrt(squared))
+    return length, jnp.where(vanishing, fallback, vector / jnp.where(vanishing, 1.0, length))
 
 
 def _perpendicular(unit):
