@@ -19,9 +19,7 @@ DEAD_OPACITY = 0.005
 _MOST_COPIES = 8  # of one splat in one move; the formula's alternating sum loses float32 digits beyond
 
 
-def relocate(
-    gaussians: Gaussians, key: PRNGKeyArray
-) -> tuple[Gaussians, Float[Array, "n"], Int[Array, ""]]:
+def relocate(gaussians: Gaussians, key: PRNGKeyArray) -> tuple[Gaussians, Float[Array, "n"], Int[Array, ""]]:
     """Move every dead splat onto a live one drawn by opacity, and thin the pile so that the picture stays the same.
 
     Returns:
@@ -44,9 +42,7 @@ def relocate(
     return moved, jnp.where(changed, 0.0, 1.0), jnp.sum(dead)
 
 
-def split_opacity(
-    opacity: Float[Array, "n"], copies: Int[Array, "n"]
-) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+def split_opacity(opacity: Float[Array, "n"], copies: Int[Array, "n"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
     """Opacity of each of N coincident copies, and the factor on their scales, that keep the blended splat (eq. 9)."""
     opacity = jnp.clip(opacity, DEAD_OPACITY, 1 - 1e-6)
     each = -jnp.expm1(jnp.log1p(-opacity) / copies)

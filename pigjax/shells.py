@@ -114,28 +114,15 @@ def solid_of(shell: Shell, *, max_cells: int = 64) -> Solid:
     centres. A cloud that is itself filled with Gaussians is bounded by their density instead. What is sheet-like or
     seen from both sides has no inside.
     """
-    kept = shell.connected & (shell.opacities >= min(_LEAST_OPACITY, np.median(shell.opacities)))
-    means = shell.means[kept if kept.any() else shell.connected]
+    means = shell.means[_surface_members(shell)]
     low, high = means.min(0), means.max(0)
     voxel = max(shell.spacing, float((high - low).max()) / max_cells)
-    origin = low - _MARGIN * voxel
-    shape = np.ceil((high - low) / voxel).astype(int) + 2 * _MARGIN + 1
+    discs, occupied, origin = _discs_of(shell, voxel)
+    if discs is None:
+        empty = np.zeros(occupied.shape, np.float32)
+        return Solid(empty, empty, origin, voxel, low, high)
 
-    samples = _disc_samples(shell, kept, voxel)
-    cells = np.floor((samples - origin) / voxel).astype(int)
-    near = np.all((cells >= 1) & (cells < shape - 1), 1)
-    flat, owner, counts = np.unique(np.ravel_multi_index(cells[near].T, shape), return_inverse=True, return_counts=True)
-    points = np.stack([np.bincount(owner, samples[near, i]) for i in range(3)], 1) / counts[:, None]
-    occupied = np.zeros(shape, bool)
-    occupied.ravel()[flat] = True
-    sky = _sky(occupied, np.stack(np.unravel_index(flat, shape), 1))
-    seen = np.any(sky != 0, 1)
-    if seen.sum() < _LEAST_DISCS:
-        return _no_solid(shape, origin, voxel, low, high)
-    discs = _oriented_discs(points[seen], sky[seen], voxel)
-    if not discs.areas.any():
-        return _no_solid(shape, origin, voxel, low, high)
-
+    shape = np.array(occupied.shape)
     grid = _Poisson(shape, origin, voxel)
     winding = grid.winding(discs.points, discs.normals, discs.areas)
     deep = ndimage.binary_erosion(winding > 0.5 * _jump(winding, discs, grid), iterations=3)
@@ -168,9 +155,46 @@ class _Discs(NamedTuple):
     weights: Float[np.ndarray, "s k"]  # of the neighbours, for smoothing; they sum to 1
 
 
-def _no_solid(shape, origin, voxel, low, high) -> Solid:
-    empty = np.zeros(shape, np.float32)
-    return Solid(empty, empty, origin, voxel, low, high)
+def surface_of(
+    shell: Shell, spacing: float, up: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
+    """Points on a surface that was seen from above, about `spacing` [m] apart, and unit normals out of it, if any.
+
+    The surface may be open below, as a table or a floor is: no normal points to where no camera was.
+    """
+    discs, _, _ = _discs_of(shell, max(shell.spacing, spacing), _DIRECTIONS[_DIRECTIONS @ up > -0.1])
+    if discs is None:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    sided = discs.areas > 0
+    return discs.points[sided], discs.normals[sided]
+
+
+def _surface_members(shell: Shell) -> Bool[np.ndarray, "n"]:
+    kept = shell.connected & (shell.opacities >= min(_LEAST_OPACITY, np.median(shell.opacities)))
+    return kept if kept.any() else shell.connected
+
+
+def _discs_of(
+    shell: Shell, voxel: float, directions: Int[np.ndarray, "d 3"] = _DIRECTIONS
+) -> tuple[_Discs | None, Bool[np.ndarray, "x y z"], Float[np.ndarray, "3"]]:
+    """Oriented discs on the shell, or None without enough of them; the voxels that it occupies and their corner."""
+    kept = _surface_members(shell)
+    means = shell.means[kept]
+    origin = means.min(0) - _MARGIN * voxel
+    shape = np.ceil(np.ptp(means, axis=0) / voxel).astype(int) + 2 * _MARGIN + 1
+    samples = _disc_samples(shell, kept, voxel)
+    cells = np.floor((samples - origin) / voxel).astype(int)
+    near = np.all((cells >= 1) & (cells < shape - 1), 1)
+    flat, owner, counts = np.unique(np.ravel_multi_index(cells[near].T, shape), return_inverse=True, return_counts=True)
+    points = np.stack([np.bincount(owner, samples[near, i]) for i in range(3)], 1) / counts[:, None]
+    occupied = np.zeros(shape, bool)
+    occupied.ravel()[flat] = True
+    sky = _sky(occupied, np.stack(np.unravel_index(flat, shape), 1), directions)
+    seen = np.any(sky != 0, 1)
+    if seen.sum() < _LEAST_DISCS:
+        return None, occupied, origin
+    discs = _oriented_discs(points[seen], sky[seen], voxel)
+    return (discs if discs.areas.any() else None), occupied, origin
 
 
 def _disc_samples(shell: Shell, kept: Bool[np.ndarray, "n"], voxel: float) -> Float[np.ndarray, "s 3"]:
@@ -195,10 +219,12 @@ def _disc_samples(shell: Shell, kept: Bool[np.ndarray, "n"], voxel: float) -> Fl
     return means[owner] + np.einsum("sij,sj->si", directions[owner], planar)
 
 
-def _sky(occupied: Bool[np.ndarray, "x y z"], cells: Int[np.ndarray, "s 3"]) -> Float[np.ndarray, "s 3"]:
+def _sky(
+    occupied: Bool[np.ndarray, "x y z"], cells: Int[np.ndarray, "s 3"], directions: Int[np.ndarray, "d 3"]
+) -> Float[np.ndarray, "s 3"]:
     """Sum of the unit directions along which each cell sees out of the grid."""
     total = np.zeros((len(cells), 3))
-    for direction in _DIRECTIONS:
+    for direction in directions:
         open_ = ~_blocked(occupied, direction)[tuple(cells.T)]
         total += open_[:, None] * (direction / np.linalg.norm(direction))
     return total

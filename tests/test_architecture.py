@@ -57,8 +57,11 @@ def test_only_io_opens_files_for_users():
     for path in MODULES:
         if room(path) in ("io", "scene", "cli"):
             continue
-        calls = {node.func.id for node in ast.walk(ast.parse(path.read_text()))
-                 if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
+        calls = {
+            node.func.id
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+        }
         assert "open" not in calls, path
 
 

@@ -162,7 +162,11 @@ def _colliders(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Collider, 
             own = jax.tree.map(lambda values, members=members: values[members], inputs.gaussians)
             colliders.append(
                 collider_from_gaussians(
-                    own, spacing=scene.simulation.dx / 2, friction=entry.friction, name=f"objects.{name}"
+                    own,
+                    spacing=scene.simulation.dx / 2,
+                    up=_axis(scene.input.up),
+                    friction=entry.friction,
+                    name=f"objects.{name}",
                 )
             )
     for plane in scene.planes.values():

@@ -18,18 +18,19 @@ from pigjax import io
 from pigjax.camera import Camera
 from pigjax.errors import SimulationError
 from pigjax.matter import Grid, Health, Particles, fit_grid
-from pigjax.mls_mpm import choose_substeps, rollout
+from pigjax.mls_mpm import SimConfig, choose_substeps, rollout
 from pigjax.overlay import id_image, legend_sheet, overlay
 from pigjax.particles import deform
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, segment, signature
 from pigjax.scene.report import RunReport
 from pigjax.scene.schema import Scene
 from pigjax.segmentation import Labels
-from pigjax.splat import RenderConfig, render, required_capacity
+from pigjax.splat import Gaussians, RenderConfig, render, required_capacity
 
 _MOST_NODES = 200_000_000
 _SHEET_FRAMES = 12
 Progress = Callable[[str, int, int], None]  # stage, done, of
+Shape = tuple[int, int, int]
 
 
 def run_scene(scene: Scene, out_dir: str | os.PathLike[str], *, progress: Progress | None = None) -> RunReport:
@@ -126,10 +127,10 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
     )
     config = replace(plan.config, substeps=substeps)
     worst: list[Health] = []
-    shape = None
+    shape = (0, 0, 0)
     for frame in range(done + 1, frames + 1):
         tell("simulate", frame - 1, frames)
-        particles, health, shape = _one_frame(particles, plan, config, dx)
+        particles, health, shape = _one_frame(particles, plan, config, dx, shape)
         worst.append(health)
         if health.nonfinite > 0 or health.max_courant >= 1:
             raise SimulationError(
@@ -159,11 +160,16 @@ def _save(folder: Path, frame: int, particles: Particles, key: str, checkpoint: 
     io.save_pytree(checkpoint, (np.asarray(frame), particles))
 
 
-def _one_frame(particles: Particles, plan: Plan, config, dx: float) -> tuple[Particles, Health, tuple[int, int, int]]:
-    """One frame on a grid around where matter is and is heading; a wall that was met means a larger grid."""
+def _one_frame(
+    particles: Particles, plan: Plan, config: SimConfig, dx: float, shape: Shape
+) -> tuple[Particles, Health, Shape]:
+    """One frame on a grid around where matter is and is heading; a wall that was met means a larger grid.
+
+    The grid keeps at least the `shape` of the last frame: another shape is another compilation.
+    """
     slack = 2.0
     while True:
-        grid = _grid_ahead(particles, plan, dx, slack)
+        grid = _grid_ahead(particles, plan, dx, slack, shape)
         moved, _, health = rollout(
             particles,
             grid,
@@ -179,10 +185,13 @@ def _one_frame(particles: Particles, plan: Plan, config, dx: float) -> tuple[Par
         slack *= 2
 
 
-def _grid_ahead(particles: Particles, plan: Plan, dx: float, slack: float) -> Grid:
+def _grid_ahead(particles: Particles, plan: Plan, dx: float, slack: float, shape: Shape) -> Grid:
     x, v = np.asarray(particles.x), np.asarray(particles.v)
     ahead = x + v * plan.frame_dt + 0.5 * plan.gravity * plan.frame_dt**2
     grid = fit_grid(np.concatenate([x, ahead]).astype(x.dtype), dx, margin=slack * dx)
+    larger = tuple(max(sides) for sides in zip(grid.shape, shape))
+    shift = np.array([(a - b) // 2 for a, b in zip(larger, grid.shape)])
+    grid = Grid(grid.origin - shift * dx, grid.dx, larger)
     if (nodes := int(np.prod(grid.shape))) > _MOST_NODES:
         raise SimulationError(
             f"matter has spread so far that its grid needs {nodes:.2g} nodes (at most {_MOST_NODES:.2g});"
@@ -201,13 +210,19 @@ def _draw(
     background = jnp.asarray(scene.camera.background)
     capacity = int(1.5 * required_capacity(gaussians, cameras))
 
-    def pose_and_render(capacity: int, x, F_visual, camera: Camera):
-        particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, (x, F_visual))
-        splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=plan.binding)
+    # everything large comes in as an argument: XLA would fold constants for minutes
+    def pose_and_render(capacity: int, gaussians: Gaussians, particles: Particles, binding, camera: Camera):
+        splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
         frame = render(splats, camera, RenderConfig(capacity=capacity), background=background, outputs=("rgb",))
         return jnp.clip(frame.rgb, 0, 1), frame.overflow
 
-    draw = jax.jit(pose_and_render, static_argnums=0)
+    compiled = jax.jit(pose_and_render, static_argnums=0)
+
+    def draw(frame: int) -> tuple[jax.Array, jax.Array]:
+        state = io.load_state(out / "states", frame, signature=key)
+        particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, (state["x"], state["F_visual"]))
+        return compiled(capacity, gaussians, particles, plan.binding, cameras[frame])
+
     sheet_frames = np.unique(np.linspace(0, frames, _SHEET_FRAMES).round().astype(int))
     sheet: list[np.ndarray] = []
 
@@ -215,12 +230,9 @@ def _draw(
         nonlocal capacity
         for frame in range(frames + 1):
             tell("draw", frame, frames + 1)
-            state = io.load_state(out / "states", frame, signature=key)
-            rgb, overflow = draw(capacity, state["x"], state["F_visual"], cameras[frame])
-            while overflow > 0:
-                capacity = int(1.5 * (capacity + overflow))
-                rgb, overflow = draw(capacity, state["x"], state["F_visual"], cameras[frame])
-            picture = np.asarray(rgb)
+            while (drawn := draw(frame))[1] > 0:
+                capacity = int(1.5 * (capacity + drawn[1]))
+            picture = np.asarray(drawn[0])
             if frame in sheet_frames:
                 sheet.append(picture)
             yield picture
