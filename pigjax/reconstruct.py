@@ -230,6 +230,7 @@ def _band_rates(step: Int[Array, ""], config: FitConfig) -> Float[Array, "k 1"]:
 
 def _loss(gaussians: Gaussians, camera: Camera, image: Float[Array, "h w 3"], config: FitConfig, extent: float):
     frame = render(gaussians, camera, config.render, background=config.background, outputs=("rgb",))
+    assert frame.rgb is not None
     loss = (1 - config.ssim_weight) * jnp.mean(jnp.abs(frame.rgb - image))
     if config.ssim_weight:
         loss += config.ssim_weight * (1 - ssim(frame.rgb, image))
@@ -278,12 +279,12 @@ def _relocate(state: FitState, config: FitConfig) -> FitState:
     return FitState(gaussians, jax.tree.map(forget, state.optimizer), state.step, state.relocated + moved)
 
 
-def _score(gaussians: Gaussians, held_out: io.Views | None, config: FitConfig) -> tuple[dict, dict]:
+def _score(gaussians: Gaussians, held_out: io.Views | None, config: FitConfig) -> tuple[dict[str, float], dict[str, float]]:
     """PSNR [dB] and SSIM of each held-out view by name."""
     if held_out is None:
         return {}, {}
-    scores = _score_views(gaussians, held_out.cameras, jnp.asarray(held_out.images), config)
-    return tuple(dict(zip(held_out.names, map(float, values))) for values in scores)
+    psnrs, ssims = _score_views(gaussians, held_out.cameras, jnp.asarray(held_out.images), config)
+    return dict(zip(held_out.names, map(float, psnrs))), dict(zip(held_out.names, map(float, ssims)))
 
 
 @eqx.filter_jit

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
@@ -50,7 +51,8 @@ def collider_from_gaussians(
     shape = np.ceil(np.ptp(points, axis=0) / spacing).astype(int) + 2 * _MARGIN + 1
     lattice = origin + spacing * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
     samples = signed_distance(lattice.reshape(-1, 3), points, normals, spacing).reshape(shape)
-    return SampledDistance(samples=samples, origin=origin, dx=spacing, friction=friction, mode=mode)
+    numbers = (jnp.asarray(v, jnp.result_type(float)) for v in (samples, origin, spacing, friction))
+    return SampledDistance(**dict(zip(("samples", "origin", "dx", "friction"), numbers)), mode=mode)
 
 
 def signed_distance(

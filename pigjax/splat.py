@@ -169,7 +169,9 @@ def surface_depth(
     tau_T: Float[Array, ""] | float = 0.5,
 ) -> Float[Array, "h w"]:
     """Camera z [m] of the Gaussian whose blend takes the transmittance below tau_T (paper 3.2); NaN where none does."""
-    return render(gaussians, camera, config, outputs=("surface_depth",), tau_T=tau_T).surface_depth
+    depth = render(gaussians, camera, config, outputs=("surface_depth",), tau_T=tau_T).surface_depth
+    assert depth is not None
+    return depth
 
 
 def required_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: RenderConfig = RenderConfig()) -> int:  # noqa: B008
@@ -274,11 +276,12 @@ def project_splats(splats: Splats, camera: Camera, config: RenderConfig) -> Proj
     else:
         a, c = a + config.dilation, c + config.dilation
     # a needle's a·c and b·b cancel in float32; the dilated determinant is at least dilation²
-    determinant = jnp.maximum(a * c - b * b, max(config.dilation**2, jnp.finfo(a.dtype).tiny))
+    tiny = float(jnp.finfo(a.dtype).tiny)
+    determinant = jnp.maximum(a * c - b * b, max(config.dilation**2, tiny))
     conics = jnp.stack([c, -b, a], 1) / determinant[:, None]
     centres = jnp.stack([fx * u + cx, fy * v + cy], 1)
 
-    faint = jnp.log(jnp.maximum(opacities / max(config.alpha_min, jnp.finfo(a.dtype).tiny), 1.0))
+    faint = jnp.log(jnp.maximum(opacities / max(config.alpha_min, tiny), 1.0))
     radii = lax.stop_gradient(jnp.sqrt(2 * faint[:, None] * jnp.stack([a, c], 1)))
     size = jnp.array([camera.width, camera.height], centres.dtype)
     on_image = jnp.all((centres + radii > 0) & (centres - radii < size), 1)

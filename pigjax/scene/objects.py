@@ -64,7 +64,7 @@ def _sheet(
         shown.append(np.asarray(id_image(frame.object_weights)))
         tinted.append(overlay(views.images[view], shown[-1]))
     sheet = io.contact_sheet(tinted, columns=2)
-    every = {number: names.get(number, "") for number in np.unique(object_id) if number > 0}
+    every = {number: names.get(number, "") for number in np.unique(object_id).tolist() if number > 0}
     legend = legend_sheet(every, image=views.images[chosen[0]], ids=shown[0], width=sheet.shape[1])
     return np.concatenate([sheet, legend])
 

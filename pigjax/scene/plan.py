@@ -143,10 +143,10 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         gravity=vector,
         config=SimConfig(kernel=spec.kernel, cfl=spec.cfl),
         clamp=ClampParams(
-            scene.clamp.tau_min,
-            scene.clamp.tau_max,
-            scene.clamp.lambda_R,
-            scene.clamp.lambda_S,
+            tau_min=jnp.asarray(scene.clamp.tau_min),
+            tau_max=jnp.asarray(scene.clamp.tau_max),
+            lambda_R=jnp.asarray(scene.clamp.lambda_R),
+            lambda_S=jnp.asarray(scene.clamp.lambda_S),
             relative=scene.clamp.relative,
         ),
         frame_dt=1 / (spec.fps * spec.slow_motion),
@@ -170,11 +170,11 @@ def _colliders(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Collider, 
                 )
             )
     for plane in scene.planes.values():
-        point, normal = jnp.array(plane.point), jnp.array(plane.normal)
-        colliders.append(Plane(point=point, normal=normal, friction=plane.friction, mode=plane.mode))
+        point, normal, friction = map(jnp.asarray, (plane.point, plane.normal, plane.friction))
+        colliders.append(Plane(point=point, normal=normal, friction=friction, mode=plane.mode))
     for box in scene.boxes.values():
-        lower, upper = jnp.array(box.lower), jnp.array(box.upper)
-        colliders.append(Box(lower=lower, upper=upper, friction=box.friction, mode=box.mode))
+        lower, upper, friction = map(jnp.asarray, (box.lower, box.upper, box.friction))
+        colliders.append(Box(lower=lower, upper=upper, friction=friction, mode=box.mode))
     return tuple(colliders)
 
 

@@ -47,9 +47,9 @@ class RunReport:
         spent = self.times.setdefault(name, StageTime())
         compiling = [0.0]
 
-        def listen(event: str, seconds: float, **_: Any) -> None:
+        def listen(event: str, duration_secs: float, **_: str | int) -> None:
             if event in _COMPILE_EVENTS:
-                compiling[0] += seconds
+                compiling[0] += duration_secs
 
         jax.monitoring.register_event_duration_secs_listener(listen)
         begun = time.perf_counter()

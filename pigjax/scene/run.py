@@ -189,9 +189,9 @@ def _grid_ahead(particles: Particles, plan: Plan, dx: float, slack: float, shape
     x, v = np.asarray(particles.x), np.asarray(particles.v)
     ahead = x + v * plan.frame_dt + 0.5 * plan.gravity * plan.frame_dt**2
     grid = fit_grid(np.concatenate([x, ahead]).astype(x.dtype), dx, margin=slack * dx)
-    larger = tuple(max(sides) for sides in zip(grid.shape, shape))
-    shift = np.array([(a - b) // 2 for a, b in zip(larger, grid.shape)])
-    grid = Grid(grid.origin - shift * dx, grid.dx, larger)
+    nx, ny, nz = (max(sides) for sides in zip(grid.shape, shape))
+    shift = np.array([(a - b) // 2 for a, b in zip((nx, ny, nz), grid.shape)])
+    grid = Grid(grid.origin - shift * dx, grid.dx, (nx, ny, nz))
     if (nodes := int(np.prod(grid.shape))) > _MOST_NODES:
         raise SimulationError(
             f"matter has spread so far that its grid needs {nodes:.2g} nodes (at most {_MOST_NODES:.2g});"

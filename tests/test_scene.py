@@ -1,0 +1,243 @@
+"""Scene files: every bad one gives one clear line; a whole small scene runs, resumes and is drawn anew."""
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+import pytest
+from test_segmentation import load_cloud
+from typer.testing import CliRunner
+
+import pigjax
+from pigjax import io
+from pigjax.cli import app
+from pigjax.errors import InputError, MissingFileError, SceneError, SimulationError
+from pigjax.scene import load_scene, run_scene, scene_from
+from pigjax.splat import Gaussians
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "tabletop" / "scene.toml"
+
+
+def values(**changes):
+    base = {
+        "input": {"gaussians": "cloud.ply"},
+        "simulation": {"dx": 0.05, "frames": 3, "fps": 30.0, "particles_per_cell": 4},
+        "objects": {"ball": {"id": 1, "material": "jelly", "young": 2000.0}},
+        "planes": {"floor": {"point": [0, 0, 0], "normal": [0, 0, 1]}},
+        "camera": {"width": 48, "height": 40, "target": [0, 0, 0.3], "radius": 2.0},
+    }
+    for key, value in changes.items():
+        section, _, name = key.partition("__")
+        base.setdefault(section, {})
+        base[section] = value if not name else {**base[section], name: value}
+    return base
+
+
+BAD = {
+    "unknown field": (values(simulation__frame=3), r"simulation\.frame: unknown field; did you mean 'frames'"),
+    "unknown section": (values(simulatoin={}), r"simulatoin: unknown field; did you mean 'simulation'"),
+    "unknown object field": (values(objects__ball={"material": "jelly", "yung": 1.0}), r"objects\.ball\.yung.*'young'"),
+    "wrong type": (values(simulation__dx="fine"), r"simulation\.dx: expected `float`, got `str`"),
+    "missing field": (values(simulation={"frames": 3}), r"simulation: object missing required field `dx`"),
+    "not positive": (values(simulation__dx=-1.0), r"simulation\.dx = -1\.0: it must be > 0"),
+    "unknown preset": (
+        values(objects__ball={"material": "jely"}),
+        r"objects\.ball\.material = 'jely': did you mean 'jelly'",
+    ),
+    "bad number": (
+        values(objects__ball={"material": "jelly", "young": -1e5}),
+        r"objects\.ball\.young = -100000\.0: Young's modulus must be > 0 Pa",
+    ),
+    "bad poisson": (values(objects__ball={"material": "jelly", "poisson": 0.5}), r"objects\.ball\.poisson = 0\.5"),
+    "no material": (values(objects__ball={}), r"objects\.ball: give either material"),
+    "two materials": (values(objects__ball={"material": "jelly", "model": "fluid"}), r"objects\.ball: give either"),
+    "unknown law": (values(objects__ball={"model": "jello", "density": 1.0}), r"objects\.ball\..*jello"),
+    "no density": (values(objects__ball={"model": "neo_hookean"}), r"objects\.ball\.density is missing"),
+    "nothing moves": (values(objects={"table": {"id": 1, "fixed": True}}), r"objects: none moves"),
+    "fixed with material": (
+        values(objects={"a": {"material": "jelly"}, "b": {"fixed": True, "material": "metal"}}),
+        r"objects\.b: a fixed object has no material",
+    ),
+    "short vector": (
+        values(objects__ball={"material": "jelly", "velocity": [1, 2]}),
+        r"velocity: expected `array` of length 3",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_scene_is_one_clear_line(case):
+    content, message = BAD[case]
+    with pytest.raises(SceneError, match=message) as caught:
+        scene_from(content)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_and_torn_files_are_clear_errors(tmp_path):
+    with pytest.raises(MissingFileError, match=r"none\.toml: scene file does not exist"):
+        load_scene(tmp_path / "none.toml")
+    (tmp_path / "torn.toml").write_text("[input\n")
+    with pytest.raises(SceneError, match=r"torn\.toml: not valid TOML"):
+        load_scene(tmp_path / "torn.toml")
+
+
+def test_the_bundled_scene_is_valid_and_moves_five_materials():
+    scene = load_scene(EXAMPLE)
+    moving = [entry for entry in scene.objects.values() if not entry.fixed]
+    assert len(moving) >= 5
+    assert len({entry.material or entry.model for entry in moving}) >= 5
+    assert scene.objects["table"].fixed
+
+
+def ball(count=400, seed=0):
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    points = 0.2 * direction + [0, 0, 0.3]
+    quats = np.tile([1.0, 0, 0, 0], (count, 1))
+    sh = rng.uniform(-1, 1, (count, 1, 3))
+    parts = points, np.full((count, 3), np.log(0.02)), quats, np.full(count, 3.0), sh
+    return Gaussians(*(jnp.asarray(v, jnp.float32) for v in parts))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene")
+    io.save_ply(path / "cloud.ply", ball())
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(folder, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out")
+    return run_scene(scene_from(values(), folder=folder), out), out
+
+
+def test_a_whole_scene_leaves_video_pictures_states_and_report(finished):
+    _, out = finished
+    assert {"video.mp4", "contact_sheet.png", "objects.png", "labels.npz", "report.json", "states"} <= {
+        p.name for p in out.iterdir()
+    }
+    written = json.loads((out / "report.json").read_text())
+    assert written["modelled"]["laws"] == ["fixed_corotated"]
+    assert written["sizes"]["frames"] == 3
+    assert written["health"]["nonfinite"] == 0
+    assert set(written["times"]) == {"read", "segment", "seed", "simulate", "draw"}
+    assert all(spent["run_s"] >= 0 for spent in written["times"].values())
+    assert written["times"]["simulate"]["compile_s"] > 0
+    # the first frame shows the ball
+    picture = io.read_image(out / "contact_sheet.png")
+    assert picture.max() > 0.3
+
+
+def test_the_ball_falls_freely_before_it_touches_the_floor(finished):
+    _, out = finished
+    states = [io.load_state(out / "states", frame) for frame in range(4)]
+    drop = [float(np.mean(s["x"][:, 2]) - np.mean(states[0]["x"][:, 2])) for s in states]
+    t = np.arange(4) / 30
+    # the ball's lowest point is 0.1 m up, so for 3 frames nothing but gravity acts
+    np.testing.assert_allclose(drop, -9.81 * t**2 / 2, atol=9.81 * 0.1 * 0.01)
+
+
+def test_a_killed_run_resumes_to_the_same_states(finished, folder, tmp_path):
+    _, whole = finished
+    scene = scene_from(values(), folder=folder)
+
+    class Killed(Exception):
+        pass
+
+    def kill(stage, done, of):
+        if stage == "simulate" and done == 2:
+            raise Killed
+
+    with pytest.raises(Killed):
+        run_scene(scene, tmp_path, progress=kill)
+    assert io.load_state(tmp_path / "states", 2)["x"].shape
+    report = run_scene(scene, tmp_path)
+    assert report.sizes["resumed_from_frame"] == 2
+    for name in ("x", "v", "F_visual"):
+        np.testing.assert_array_equal(
+            io.load_state(tmp_path / "states", 3)[name], io.load_state(whole / "states", 3)[name]
+        )
+
+
+def test_drawing_anew_simulates_nothing_and_another_scene_is_refused(finished, folder, tmp_path):
+    _, done = finished
+    out = tmp_path / "copy"
+    shutil.copytree(done, out)
+    (out / "video.mp4").unlink()
+    turned = scene_from(values(camera__elevation=60.0, clamp={"mode": "covariance"}), folder=folder)
+    report = run_scene(turned, out)
+    assert (out / "video.mp4").exists()
+    assert report.sizes["resumed_from_frame"] == 3
+    assert report.health == {}
+    with pytest.raises(InputError, match="belongs to another run"):
+        run_scene(scene_from(values(simulation__dx=0.06), folder=folder), out)
+
+
+def test_a_simulation_that_breaks_down_keeps_its_good_frames(folder, tmp_path, monkeypatch):
+    import pigjax.scene.run as run_module
+
+    whole = run_module.rollout
+
+    def poisoned(particles, *args, **kwargs):
+        moved, trajectory, health = whole(particles, *args, **kwargs)
+        if poisoned.calls == 1:
+            health = replace(health, nonfinite=jnp.asarray(3))
+        poisoned.calls += 1
+        return moved, trajectory, health
+
+    poisoned.calls = 0
+    monkeypatch.setattr(run_module, "rollout", poisoned)
+    with pytest.raises(SimulationError, match=r"frame 2 of 3: 3 particles became NaN.*states up to frame 1 are kept"):
+        run_scene(scene_from(values(), folder=folder), tmp_path)
+    assert io.load_state(tmp_path / "states", 1)["x"].shape
+    assert (tmp_path / "report.json").exists()
+
+
+def test_report_and_scene_round_trip_as_plain_values(finished):
+    report, _ = finished
+    assert msgspec.json.decode(msgspec.json.encode(report.as_dict()))["sizes"]["particles"] > 400
+
+
+def test_info_says_what_files_hold(folder):
+    said = CliRunner().invoke(app, ["info", str(folder / "cloud.ply")])
+    assert said.exit_code == 0
+    described = pigjax.scene.objects.describe_file(folder / "cloud.ply")
+    assert described["Gaussians"] == "400"
+    assert described["SH degree"] == "0"
+    assert "duck (jelly)" in pigjax.scene.objects.describe_file(EXAMPLE)["moving"]
+    assert pigjax.scene.objects.describe_file(EXAMPLE.parent)["views"].startswith("40, ")
+
+
+@pytest.mark.parametrize("command", [[], ["demo"], ["run"], ["reconstruct"], ["segment"], ["info"]])
+def test_every_command_has_help(command):
+    said = CliRunner().invoke(app, [*command, "--help"])
+    assert said.exit_code == 0
+    assert "Usage" in said.output
+
+
+def test_bad_input_is_exit_code_2_and_one_line(tmp_path):
+    code = "import sys; sys.argv = ['pigjax', 'info', sys.argv[1]]; from pigjax.cli import main; main()"
+    run = subprocess.run([sys.executable, "-c", code, str(tmp_path / "no.ply")], capture_output=True, text=True)
+    assert run.returncode == 2
+    assert "no.ply" in run.stderr
+    assert len(run.stderr.strip().splitlines()) == 1
+    assert "Traceback" not in run.stderr
+
+
+def test_segment_writes_labels_objects_and_a_sheet(tmp_path):
+    views = io.load_views(EXAMPLE.parent, masks=True, max_size=64)[[0, 5, 10, 15]]
+    cloud, _ = load_cloud()
+    counts = pigjax.scene.objects.segment_files(cloud, views, {2: "duck"}, tmp_path, tau_T=0.5, tau_d=0.05, fill=True)
+    assert sum(counts.values()) == len(cloud)
+    assert (tmp_path / "objects" / "002_duck.ply").exists()
+    assert len(io.load_ply(tmp_path / "objects" / "002_duck.ply")) == counts[2]
+    assert io.read_image(tmp_path / "objects.png").shape[1] >= 128
+    np.testing.assert_array_equal(np.bincount(np.load(tmp_path / "labels.npz")["object_id"])[2], counts[2])
