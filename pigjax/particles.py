@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from pigjax.arrays import array_field
 from pigjax.clamp import ClampParams, eigen_clamp
+from pigjax.colliders import Collider
 from pigjax.errors import InputError
 from pigjax.filling import jittered, lattice_cells, lattice_step
 from pigjax.materials import Material, MaterialTable, material_table
@@ -48,6 +49,7 @@ def seed_particles(
     velocities: Mapping[int, Any] | None = None,
     particles_per_cell: float | int = 8,
     gaussians_per_cell: int | None = None,
+    colliders: Sequence[Collider] = (),
     seed: int = 0,
     max_cells: int = 64,
     max_particles: int = 4_000_000,
@@ -69,6 +71,7 @@ def seed_particles(
         velocities: initial velocity [m/s] by object id, zero for the others.
         particles_per_cell: lattice particles in a full cell.
         gaussians_per_cell: most Gaussians that become particles in one lattice cell; `bind` carries the others.
+        colliders: where they are, objects are not filled.
         seed: of the jitter.
         max_cells: finest resolution of the inside test, see `fill_interior`.
         max_particles: lattice cells that one object may have.
@@ -93,7 +96,7 @@ def seed_particles(
 
     parts = []
     for row, item in enumerate(objects):
-        matter = _matter_of(item, objects, step, fill, gaussians_per_cell, seed, max_particles)
+        matter = _matter_of(item, objects, colliders, step, fill, gaussians_per_cell, seed, max_particles)
         velocity = np.broadcast_to(np.asarray(velocities.get(item.name, 0.0), float), matter.positions.shape)
         parts.append((*matter, np.full(len(matter.volumes), row), velocity))
     positions, volumes, carried, rows, velocity = (np.concatenate(column) for column in zip(*parts))
@@ -155,6 +158,7 @@ def _step(objects: list[_Object], spacing: float | int | None, particles_per_cel
 def _matter_of(
     item: _Object,
     objects: list[_Object],
+    colliders: Sequence[Collider],
     step: float,
     fill: bool,
     gaussians_per_cell: int | None,
@@ -168,6 +172,8 @@ def _matter_of(
         raise InputError(f"{name} holds {solid.volume:.3g} m³, less than one particle at {step:.3g} m; refine spacing.")
     points, contents = lattice_cells(solid, step, max_particles=max_particles, name=name)
     room = ~_taken(points, item, objects)
+    for collider in colliders:
+        room &= np.asarray(collider.distance(jnp.asarray(points))) > 0
     points, contents = points[room], contents[room]
 
     own = np.flatnonzero(shell.connected)

@@ -279,7 +279,9 @@ def _relocate(state: FitState, config: FitConfig) -> FitState:
     return FitState(gaussians, jax.tree.map(forget, state.optimizer), state.step, state.relocated + moved)
 
 
-def _score(gaussians: Gaussians, held_out: io.Views | None, config: FitConfig) -> tuple[dict[str, float], dict[str, float]]:
+def _score(
+    gaussians: Gaussians, held_out: io.Views | None, config: FitConfig
+) -> tuple[dict[str, float], dict[str, float]]:
     """PSNR [dB] and SSIM of each held-out view by name."""
     if held_out is None:
         return {}, {}

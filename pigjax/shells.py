@@ -156,13 +156,14 @@ class _Discs(NamedTuple):
 
 
 def surface_of(
-    shell: Shell, spacing: float, up: Float[np.ndarray, "3"]
+    shell: Shell, spacing: float, up: Float[np.ndarray, "3"], blockers: Float[np.ndarray, "b 3"] | None = None
 ) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
     """Points on a surface that was seen from above, about `spacing` [m] apart, and unit normals out of it, if any.
 
-    The surface may be open below, as a table or a floor is: no normal points to where no camera was.
+    The surface may be open below, as a table or a floor is: no normal points to where no camera was. What lies behind
+    `blockers`, points of other objects [m], was not seen either and is left out.
     """
-    discs, _, _ = _discs_of(shell, max(shell.spacing, spacing), _DIRECTIONS[_DIRECTIONS @ up > -0.1])
+    discs, _, _ = _discs_of(shell, max(shell.spacing, spacing), _DIRECTIONS[_DIRECTIONS @ up > -0.1], blockers)
     if discs is None:
         return np.zeros((0, 3)), np.zeros((0, 3))
     sided = discs.areas > 0
@@ -175,7 +176,10 @@ def _surface_members(shell: Shell) -> Bool[np.ndarray, "n"]:
 
 
 def _discs_of(
-    shell: Shell, voxel: float, directions: Int[np.ndarray, "d 3"] = _DIRECTIONS
+    shell: Shell,
+    voxel: float,
+    directions: Int[np.ndarray, "d 3"] = _DIRECTIONS,
+    blockers: Float[np.ndarray, "b 3"] | None = None,
 ) -> tuple[_Discs | None, Bool[np.ndarray, "x y z"], Float[np.ndarray, "3"]]:
     """Oriented discs on the shell, or None without enough of them; the voxels that it occupies and their corner."""
     kept = _surface_members(shell)
@@ -189,6 +193,9 @@ def _discs_of(
     points = np.stack([np.bincount(owner, samples[near, i]) for i in range(3)], 1) / counts[:, None]
     occupied = np.zeros(shape, bool)
     occupied.ravel()[flat] = True
+    if blockers is not None:
+        cells = np.floor((blockers - origin) / voxel).astype(int)
+        occupied[tuple(cells[np.all((cells >= 0) & (cells < shape), 1)].T)] = True
     sky = _sky(occupied, np.stack(np.unravel_index(flat, shape), 1), directions)
     seen = np.any(sky != 0, 1)
     if seen.sum() < _LEAST_DISCS:

@@ -14,8 +14,10 @@ from pigjax.errors import InputError
 from pigjax.shells import shell_of, surface_of
 from pigjax.splat import Gaussians
 
-_NEIGHBOURS = 24  # samples of the surface that shape the distance at a point
+_NEIGHBOURS = 64  # samples of the surface that shape the distance at a point
+_SMOOTHING = 3  # width of their weights, in distances between samples; trained splats lie unevenly
 _MARGIN = 3  # samples of the distance around the object
+_DEPTH = 16  # samples below it: an open surface carries that deep
 
 
 def collider_from_gaussians(
@@ -23,6 +25,7 @@ def collider_from_gaussians(
     *,
     spacing: float,
     up: Vector = (0.0, 0.0, 1.0),
+    others: Float[np.ndarray, "b 3"] | None = None,
     friction: float = 0.5,
     mode: str = "separate",
     name: str = "object",
@@ -36,6 +39,7 @@ def collider_from_gaussians(
         gaussians: of the object.
         spacing: between samples of the distance, the simulation's dx or finer [m].
         up: axis of the world that points up; no surface faces down.
+        others: centres of the Gaussians of other objects, which hid parts of the surface [m].
         friction: Coulomb's coefficient.
         mode: of `Collider`.
         name: of the object, for messages.
@@ -44,28 +48,36 @@ def collider_from_gaussians(
         InputError: the Gaussians make no surface with an outer side.
     """
     shell = shell_of(jax.tree.map(np.asarray, gaussians), name=name)
-    points, normals = surface_of(shell, spacing, np.asarray(up, float))
+    above = np.asarray(up, float) / np.linalg.norm(up)
+    points, normals = surface_of(shell, spacing, above, others)
     if len(points) == 0:
         raise InputError(f"{name}: its Gaussians make no surface, so it cannot be a collider; use a plane or a box.")
-    origin = points.min(0) - _MARGIN * spacing
-    shape = np.ceil(np.ptp(points, axis=0) / spacing).astype(int) + 2 * _MARGIN + 1
-    lattice = origin + spacing * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
-    samples = signed_distance(lattice.reshape(-1, 3), points, normals, spacing).reshape(shape)
-    numbers = (jnp.asarray(v, jnp.result_type(float)) for v in (samples, origin, spacing, friction))
+    low = points.min(0) - spacing * (_MARGIN + _DEPTH * np.maximum(above, 0))
+    high = points.max(0) + spacing * (_MARGIN + _DEPTH * np.maximum(-above, 0))
+    shape = np.ceil((high - low) / spacing).astype(int) + 1
+    lattice = low + spacing * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
+    width = _SMOOTHING * max(shell.spacing, spacing)
+    samples = signed_distance(lattice.reshape(-1, 3), points, normals, width).reshape(shape)
+    numbers = (jnp.asarray(v, jnp.result_type(float)) for v in (samples, low, spacing, friction))
     return SampledDistance(**dict(zip(("samples", "origin", "dx", "friction"), numbers)), mode=mode)
 
 
 def signed_distance(
     at: Float[np.ndarray, "p 3"], points: Float[np.ndarray, "s 3"], normals: Float[np.ndarray, "s 3"], width: float
 ) -> Float[np.ndarray, "p"]:
-    """Distance from an oriented point cloud, negative behind it (implicit moving least squares; Kolluri 2008).
+    """Distance from an oriented point cloud, negative behind it: moving averages (Alexa & Adamson 2004).
 
-    The mean of the distances from the planes of the nearest points, weighed by a Gaussian of `width` [m], which grows
-    with the distance from the surface so that a far point does not follow the noise of a few normals.
+    Measured from the plane through the mean of the nearest points across their mean normal, both weighed by a Gaussian
+    of `width` [m], which grows with the distance so that a far place does not follow the noise of a few normals.
     """
     gap, nearest = cKDTree(points).query(at, k=min(_NEIGHBOURS, len(points)), workers=-1)
     gap, nearest = gap.reshape(len(at), -1), nearest.reshape(len(at), -1)
     reach = np.maximum(width, 0.5 * gap[:, :1])
     weights = np.exp(-(gap**2 - gap[:, :1] ** 2) / (2 * reach**2))
-    planes = np.einsum("pkj,pkj->pk", at[:, None] - points[nearest], normals[nearest])
-    return np.sum(weights * planes, 1) / np.sum(weights, 1)
+    weights = weights / weights.sum(1, keepdims=True)
+    centre = np.einsum("pk,pkj->pj", weights, points[nearest])
+    normal = np.einsum("pk,pkj->pj", weights, normals[nearest])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    # between two sides the normals cancel: then the nearest one decides
+    normal = np.where(length > 0.1, normal / np.maximum(length, 0.1), normals[nearest[:, 0]])
+    return np.sum((at - centre) * normal, 1)

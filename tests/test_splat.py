@@ -75,13 +75,14 @@ def test_exact_settings_equal_the_dense_compositor_with_the_same_thresholds_in_f
     assert np.abs(frame.alpha - alpha).max() < 1e-12
 
 
-def test_default_thresholds_cost_less_than_60_dB(x64):
+def test_error_of_the_default_thresholds_is_small_and_printed(x64):
     scene, camera = make_scene(count=300, spread=0.6)
     default = render(gaussians_of(scene), camera, RenderConfig(), background=1.0).rgb
     exact = render(gaussians_of(scene), camera, EXACT, background=1.0).rgb
     psnr = -10 * np.log10(np.mean((default - exact) ** 2))
     print(f"defaults against exact settings: {psnr:.1f} dB, worst {np.abs(default - exact).max():.1e}")
-    assert psnr > 50 and np.abs(default - exact).max() < 2e-2
+    assert psnr > 50
+    assert np.abs(default - exact).max() < 2e-2
 
 
 @pytest.fixture(scope="module")
@@ -105,14 +106,15 @@ def test_images_equal_gsplat(gsplat_reference):
         error = np.abs(getattr(frame, name) - data[name])
         psnr = -10 * np.log10(np.mean(error**2))
         print(f"{name} against gsplat: {psnr:.1f} dB, worst {error.max():.1e}")
-        assert psnr >= 60 and error.max() < 5e-3
+        assert psnr >= 60
+        assert error.max() < 5e-3
     np.testing.assert_allclose(np.nan_to_num(frame.surface_depth), data["surface_depth"], rtol=1e-4)
     antialiased = render(gaussians, camera, RenderConfig(alpha_max=0.999, antialias=True)).rgb
     assert np.abs(antialiased - data["rgb_antialiased"]).max() < 5e-3
 
 
 def test_gradients_equal_gsplat(gsplat_reference):
-    data, gaussians, camera = gsplat_reference
+    data, _, camera = gsplat_reference
 
     def loss(means, quats, scales, opacities, sh, viewmat, focal):
         logit = jnp.log(opacities / (1 - opacities))
@@ -255,7 +257,7 @@ def test_degenerate_splats_draw_right_and_have_finite_gradients(case):
     inputs = [jnp.asarray(scene[k], jnp.float32) for k in ("means", "scales", "quats", "opacities", "sh")]
     frame, gradients = degenerate_loss(camera, *inputs)
     if case != "zero quaternion":
-        rgb, alpha, *_ = dense(scene, camera, RenderConfig())
+        rgb, *_ = dense(scene, camera, RenderConfig())
         assert np.abs(frame.rgb - rgb).max() < 2e-4, case
     assert all(np.isfinite(g).all() for g in gradients)
 

@@ -71,10 +71,11 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress) -> None:
     with report.stage("segment"):
         tell("segment", 0, 1)
         labels = segment(scene, inputs)
-        np.savez_compressed(out / "labels.npz", object_id=labels.object_id, confidence=labels.confidence)
     with report.stage("seed"):
         tell("seed", 0, 1)
         plan = make_plan(scene, inputs, labels)
+        labels = plan.labels
+        np.savez_compressed(out / "labels.npz", object_id=labels.object_id, confidence=labels.confidence)
     _describe(scene, inputs, plan, labels, report)
     with report.stage("simulate"):
         _simulate(scene, plan, out / "states", key, report, tell)

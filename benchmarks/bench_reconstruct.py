@@ -1,0 +1,35 @@
+"""Held-out PSNR against time on the bundled tabletop: `python benchmarks/bench_reconstruct.py [--steps N] [--out FILE]`."""
+
+import argparse
+import resource
+from pathlib import Path
+
+from pigjax import FitConfig, load_points, load_views, reconstruct, save_ply
+
+TABLETOP = Path(__file__).parents[1] / "examples" / "tabletop"
+
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("--steps", type=int, default=1500)
+parser.add_argument("--splats", type=int, default=15_000)
+parser.add_argument("--every", type=int, default=500, help="steps between evaluations")
+parser.add_argument("--out", type=Path, help="write the Gaussians here (.ply)")
+arguments = parser.parse_args()
+
+views = load_views(TABLETOP)
+config = FitConfig(steps=arguments.steps, splats=arguments.splats, background=1.0, evaluate_every=arguments.every)
+
+
+def tell(progress):
+    if progress.psnr is not None:
+        print(f"step {progress.step:5d}  {progress.seconds:6.1f} s  held-out {progress.psnr:.2f} dB", flush=True)
+
+
+result = reconstruct(views, config, points=load_points(views.points_path), callback=tell)
+print(
+    f"reconstruct {arguments.splats} splats SH {config.sh_degree}: mean over {len(result.psnr)} held-out views"
+    f" {result.mean_psnr:.2f} dB, SSIM {sum(result.ssim.values()) / len(result.ssim):.4f},"
+    f" {result.history[-1].seconds:.0f} s with compilation,"
+    f" peak {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB"
+)
+if arguments.out:
+    save_ply(arguments.out, result.gaussians)
