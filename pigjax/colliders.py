@@ -93,6 +93,7 @@ class Plane(Collider):
     normal: Float[Array, "3"] = _number()  # out of the solid side, any length
 
     def distance(self, points: Points) -> Float[Array, "*n"]:
+        """Along the normal."""
         return ((points - self.point) * safe_normalize(self.normal)).sum(-1)
 
 
@@ -103,6 +104,7 @@ class Sphere(Collider):
     radius: Float[Array, ""] = _number()  # [m]
 
     def distance(self, points: Points) -> Float[Array, "*n"]:
+        """To the sphere."""
         return safe_norm(points - self.centre) - self.radius
 
 
@@ -113,6 +115,7 @@ class Box(Collider):
     upper: Float[Array, "3"] = _number()  # [m]
 
     def distance(self, points: Points) -> Float[Array, "*n"]:
+        """To the nearest face, edge or corner."""
         beyond = jnp.maximum(self.lower - points, points - self.upper)
         return safe_norm(jnp.maximum(beyond, 0.0)) + jnp.minimum(beyond.max(-1), 0.0)
 
@@ -125,11 +128,12 @@ class SampledDistance(Collider):
     dx: Float[Array, ""] = _number()  # [m]
 
     def distance(self, points: Points) -> Float[Array, "*n"]:
+        """By trilinear interpolation; beyond the lattice, at least the way to it."""
         cells = (points - self.origin) / self.dx
         last = jnp.asarray(self.samples.shape) - 1
         low = jnp.clip(jnp.floor(lax.stop_gradient(cells)).astype(int), 0, last - 1)
         part = jnp.clip(cells - low, 0.0, 1.0)
-        total = 0.0
+        total = jnp.zeros_like(cells[..., 0])
         for corner in np.ndindex(2, 2, 2):
             weight = jnp.where(jnp.asarray(corner), part, 1 - part).prod(-1)
             index = low + jnp.asarray(corner)

@@ -1,7 +1,7 @@
 """MLS-MPM (Hu et al. 2018, doi 10.1145/3197517.3201293) with APIC: one explicit step, and whole rollouts.
 
-Particles keep the user's order outside. Inside they are grouped by law, each group padded to whole chunks: a law is
-traced for its own particles only, and a scan over chunks keeps what happens to a particle inside the cache.
+Each stage loops over the groups of `matter.group_by_law`, and in a group over chunks of particles. The stages read as
+the equations do; `transfers.stage` marks where their intermediates must be kept.
 """
 
 from __future__ import annotations
@@ -18,13 +18,27 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from pigjax import linalg
 from pigjax.arrays import static_field
 from pigjax.colliders import Collider, Contact
 from pigjax.errors import InputError
-from pigjax.materials import LAWS, MaterialTable, Parameters, respond
+from pigjax.materials import MaterialTable, respond
 from pigjax.materials.tensors import determinant, product
-from pigjax.matter import WALL, Grid, Health, Particles, StepHealth, Trajectory
+from pigjax.matter import (
+    WALL,
+    Grid,
+    Group,
+    Health,
+    Particles,
+    State,
+    StepHealth,
+    Trajectory,
+    bound_visual,
+    group_by_law,
+    mark_nonfinite,
+    only_finite,
+    perfect_health,
+    select,
+)
 from pigjax.transfers import KERNELS, gather, scatter, stage, stencil
 
 Vector = Float[Array, "3"] | Sequence[float | int] | np.ndarray
@@ -66,8 +80,10 @@ class SimConfig(eqx.Module):
 def stable_dt(
     table: MaterialTable, grid: Grid, *, max_speed: Float[Array, ""] | float, cfl: float = 0.4
 ) -> Float[Array, ""]:
-    """Longest explicit step [s]: no wave of the stiffest law, on matter that moves at max_speed [m/s], crosses more than
-    `cfl` cells, and no viscous momentum diffuses farther than the grid resolves."""
+    """Longest stable explicit step [s] of matter that moves at up to max_speed [m/s].
+
+    No wave of the stiffest law crosses more than `cfl` cells, nor does viscous momentum diffuse too far for the grid.
+    """
     advective = grid.dx / (table.wave_speed.max() + max_speed)
     viscous = grid.dx**2 / (4 * (table.viscosity / table.density).max())  # infinite without viscosity
     return cfl * jnp.minimum(advective, viscous)
@@ -80,7 +96,7 @@ def choose_substeps(
     config: SimConfig,
     *,
     frames: int,
-    frame_dt: float,
+    frame_dt: Float[Array, ""] | float,
     gravity: Vector,
     colliders: tuple[Collider, ...] = (),
 ) -> int:
@@ -89,11 +105,11 @@ def choose_substeps(
     The speed that falling can reach, by time or by the size of the grid, counts beside the present one. The number is
     rounded up by at most an eighth, so that similar scenes share one compilation.
     """
-    fall = float(np.linalg.norm(gravity))
+    fall, duration = float(np.linalg.norm(gravity)), float(frame_dt)
     height = float(grid.dx) * math.hypot(*grid.shape)
     speed = _max_speed(particles, colliders)
-    speed = min(speed + fall * frames * frame_dt, math.sqrt(speed**2 + 2 * fall * height))
-    needed = math.ceil(float(frame_dt) / float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl)) * (1 - 1e-6))
+    speed = min(speed + fall * frames * duration, math.sqrt(speed**2 + 2 * fall * height))
+    needed = math.ceil(duration / float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl)) * (1 - 1e-6))
     unit = 2 ** max(needed.bit_length() - 4, 0)
     return max(-(-needed // unit) * unit, 1)
 
@@ -116,7 +132,9 @@ def step(
     _check_table(particles, table)
     if not _is_traced(particles, grid, table, dt, gravity, colliders):
         _check_dt(float(dt), particles, grid, table, config, colliders)
-    return _step(particles, grid, table, config, _like(dt, particles), _like(gravity, particles), colliders)
+    return _step(
+        particles, grid, table, config, _like(dt, particles), _like(jnp.asarray(gravity), particles), colliders
+    )
 
 
 def rollout(
@@ -152,34 +170,15 @@ def rollout(
             " choose_substeps finds the number from concrete values."
         )
     dt = _like(frame_dt, particles) / substeps
-    return _rollout(particles, grid, table, config, dt, _like(gravity, particles), colliders, frames, substeps)
-
-
-class _State(NamedTuple):
-    """What changes of the particles of one law; the leading axes are chunk and particle."""
-
-    x: Array
-    v: Array
-    C: Array
-    F: Array
-    stress: Array  # Kirchhoff, of F [Pa]: the return map that finds F finds it too
-    hardening: Array
-    F_visual: Array | None  # None where F is the total deformation
-
-
-class _Group(NamedTuple):
-    """What does not change of the particles of one law."""
-
-    law: str
-    mass: Array
-    volume0: Array  # 0 for particles that only fill the last chunk
-    parameters: Parameters  # one row for all, or one for each particle
+    return _rollout(
+        particles, grid, table, config, dt, _like(jnp.asarray(gravity), particles), colliders, frames, substeps
+    )
 
 
 class _Scene(NamedTuple):
     """What all steps of a simulation share."""
 
-    groups: tuple[_Group, ...]
+    groups: tuple[Group, ...]
     grid: Grid
     config: SimConfig
     dt: Array
@@ -195,7 +194,7 @@ class _Scene(NamedTuple):
 def _step(particles, grid, table, config, dt, gravity, colliders):
     scene, states, restore = _prepare(particles, grid, table, config, dt, gravity, colliders)
     states, health = _advance(scene, states, 0.0)
-    return restore(_bound_visual(scene, states)), health
+    return restore(_bounded(states, config)), health
 
 
 @eqx.filter_jit
@@ -206,7 +205,7 @@ def _rollout(particles, grid, table, config, dt, gravity, colliders, frames, sub
     def substep(carry, _):
         states, worst, steps = carry
         states, health = _advance(scene, states, steps * dt)
-        return (states, _worse(worst, health), steps + 1), None
+        return (states, worst.worse(health), steps + 1), None
 
     @partial(jax.checkpoint, prevent_cse=False)
     def steps_of_block(carry, _):
@@ -215,13 +214,13 @@ def _rollout(particles, grid, table, config, dt, gravity, colliders, frames, sub
     def frame(carry, _):
         states, worst, steps = carry
         (states, health, steps), _ = lax.scan(
-            steps_of_block, (states, _healthy(dt), steps), None, length=substeps // block
+            steps_of_block, (states, perfect_health(dt.dtype), steps), None, length=substeps // block
         )
-        states = _bound_visual(scene, states)
+        states = _bounded(states, config)
         moved = restore(states)
-        return (states, _worse(worst, health), steps), (moved.x, moved.v, moved.F_visual, health.is_bad())
+        return (states, worst.worse(health), steps), (moved.x, moved.v, moved.F_visual, health.is_bad())
 
-    start = (states, _healthy(dt), jnp.zeros((), int))
+    start = (states, perfect_health(dt.dtype), jnp.zeros((), int))
     (states, worst, _), (*moved, bad) = lax.scan(frame, start, None, length=frames)
     first_bad = jnp.where(bad.any(), jnp.argmax(bad), -1)
     health = Health(**vars(worst), substeps=jnp.asarray(substeps), first_bad_frame=first_bad)
@@ -234,10 +233,10 @@ def _advance(scene, states, time):
     for group, state in zip(scene.groups, states):
         nodes = _particles_to_grid(scene, group, state, nodes)
     velocity = jax.checkpoint(partial(_update_grid, scene), prevent_cse=False)(nodes, time)
-    health, moved = _healthy(scene.dt), []
+    health, moved = perfect_health(scene.dt.dtype), []
     for group, state in zip(scene.groups, states):
         state, own = _grid_to_particles(scene, group, state, velocity)
-        health = _worse(health, own)
+        health = health.worse(own)
         moved.append(state)
     return tuple(moved), health
 
@@ -248,14 +247,13 @@ def _particles_to_grid(scene, group, state, nodes):
 
     def chunk(nodes, particles):
         state, mass, volume = particles
-        ok, state = _only_finite(state)
+        ok, state = only_finite(state)
         mass, volume = jnp.where(ok, mass, 0.0), jnp.where(ok, volume, 0.0)
         at = stage(scene.go, partial(stencil, kernel=kernel, shape=scene.grid.shape), _cells(scene.grid, state.x))
         force = (-scene.dt * kernel.inverse_inertia / dx) * volume * _tensors(state.stress)
         affine = dx * mass * _tensors(state.C) + force
         return scatter(nodes, at, mass, mass * state.v.T, affine, kernel, scene.go), None
 
-    state = state._replace(hardening=None, F_visual=None, F=None)
     return _scan_chunks(chunk, nodes, (state, group.mass, group.volume0))[0]
 
 
@@ -267,7 +265,8 @@ def _update_grid(scene, nodes, time):
     velocity = nodes[..., 1:] / scene.unit_mass / jnp.where(filled, mass, 1.0) + scene.dt * scene.gravity
     velocity = jnp.where(filled, velocity, 0.0)
     for collider, contact in zip(scene.colliders, scene.contacts):
-        velocity = collider.apply(contact or collider.contact(scene.grid.points, time), velocity)
+        contact = collider.contact(scene.grid.points, time) if contact is None else contact
+        velocity = collider.apply(contact, velocity)
     if scene.frozen is not None:
         velocity = jnp.where(scene.frozen[..., None], 0.0, velocity)
     return _apply_walls(velocity, scene.config.walls)
@@ -295,7 +294,7 @@ def _grid_to_particles(scene, group, state, velocity):
 
     def chunk(velocity, particles):
         old, volume, rows = particles
-        ok, state = _only_finite(old)
+        ok, state = only_finite(old)
         at = stage(scene.go, partial(stencil, kernel=kernel, shape=scene.grid.shape), _cells(scene.grid, state.x))
         v, per_cell = gather(velocity, at, kernel, scene.go)
         rate = per_cell / dx
@@ -307,8 +306,8 @@ def _grid_to_particles(scene, group, state, velocity):
         if state.F_visual is not None:
             visual = _tensors(state.F_visual)
             visual = _rows(visual + dt * product(rate, visual))
-        new = _State(held.T, v.T, _rows(rate), _rows(matter.F), _rows(matter.stress), matter.hardening, visual)
-        new = _mark_nonfinite(_select(ok, new, old))
+        new = State(held.T, v.T, _rows(rate), _rows(matter.F), _rows(matter.stress), matter.hardening, visual)
+        new = mark_nonfinite(select(ok, new, old))
         alive, J = ok & (volume > 0), determinant(matter.F)
         health = StepHealth(
             min_J=jnp.where(alive, J, jnp.inf).min(),
@@ -348,138 +347,25 @@ def _rows(tensors):
     return jnp.transpose(tensors, (2, 0, 1))
 
 
-def _select(ok, new, old):
-    return jax.tree.map(lambda n, o: jnp.where(ok.reshape(-1, *[1] * (n.ndim - 1)), n, o), new, old)
-
-
-def _only_finite(state):
-    """Which particles are still finite, and a state without the others, whose derivative is zero."""
-    ok = jnp.isfinite(state.x).all(-1)
-    rest = jax.tree.map(jnp.zeros_like, state)
-    if state.F is not None:
-        rest = rest._replace(F=jnp.broadcast_to(jnp.eye(3, dtype=state.F.dtype), state.F.shape))
-    return ok, _select(ok, state, rest)
-
-
-def _mark_nonfinite(state):
-    """Position NaN where anything of a particle is not finite."""
-    axis = state.hardening.ndim
-    total = sum(leaf.sum(range(axis, leaf.ndim)) for leaf in jax.tree.leaves(state))
-    return state._replace(x=jnp.where(jnp.isfinite(total)[..., None], state.x, jnp.nan))
-
-
-def _bound_visual(scene, states):
-    """Hold the stretches of F_visual in bounds: flow without end would otherwise draw needles."""
-    low, high = scene.config.visual_stretch
-
-    def bound(state):
-        if state.F_visual is None:
-            return state
-        u, s, v = linalg.svd(state.F_visual)
-        s = jnp.clip(s, low, high)
-        return state._replace(F_visual=linalg.matmul3(u * s[..., None, :], linalg.transpose(v)))
-
-    return tuple(bound(state) for state in states)
-
-
 def _prepare(particles, grid, table, config, dt, gravity, colliders):
     """Scene, states by law, and the function that puts states back into the user's order."""
-    rows_of = {law: [row for row, l in enumerate(table.laws) if l == law] for law in table.laws}
-    sizes = {law: sum(particles.counts[row] for row in rows) for law, rows in rows_of.items()}
-    laws = [law for law, size in sizes.items() if size]
-    order = None
-    if len(laws) > 1:
-        rank = jnp.asarray([laws.index(law) if law in laws else -1 for law in table.laws])
-        order = jnp.argsort(rank[particles.material], stable=True)
-
-    ends = np.cumsum([sizes[law] for law in laws])
-    sorted_particles = particles if order is None else _reorder(particles, order)
-    parts = [jax.tree.map(lambda a: a[end - sizes[law] : end], sorted_particles) for law, end in zip(laws, ends)]
-    groups, states, frozen = [], [], None
-    for law, part in zip(laws, parts):
-        if LAWS[law].respond is None:
-            frozen = _touched_nodes(grid, part.x, KERNELS[config.kernel])
-        else:
-            group, state = _group(law, part, rows_of[law], table, config, dt)
-            groups.append(group)
-            states.append(state)
-
-    def restore(states):
-        remaining = iter(states)
-        moved = [
-            part if LAWS[law].respond is None else _ungroup(part, next(remaining)) for law, part in zip(laws, parts)
-        ]
-        merged = jax.tree.map(lambda *pieces: jnp.concatenate(pieces), *moved)
-        return merged if order is None else _reorder(merged, jnp.argsort(order))
-
+    grid, table, colliders = _like((grid, table, colliders), particles)
+    on_cpu = jax.default_backend() == "cpu"
+    groups, states, still, restore = group_by_law(particles, table, config.chunk or (_CACHED if on_cpu else None))
     points = grid.points
     scene = _Scene(
-        groups=tuple(groups),
+        groups=groups,
         grid=grid,
         config=config,
         dt=dt,
         gravity=gravity,
         colliders=colliders,
         contacts=tuple(c.contact(points) if c.velocity is None else None for c in colliders),
-        frozen=frozen,
+        frozen=None if still is None else _touched_nodes(grid, still.x, KERNELS[config.kernel]),
         unit_mass=lax.stop_gradient(particles.mass.max()),
         go=particles.volume0[0] > 0,
     )
-    return scene, tuple(states), restore
-
-
-def _group(law, part, rows, table, config, dt):
-    """Particles of one law in whole chunks, the last particle repeated without mass, with their present stress."""
-    count = len(part)
-    limit = config.chunk or (_CACHED if jax.default_backend() == "cpu" else count)
-    chunks = -(-count // limit)
-    size = -(-count // chunks)
-
-    def chunked(array):
-        padding = [(0, chunks * size - count)] + [(0, 0)] * (array.ndim - 1)
-        return jnp.pad(array, padding, mode="edge").reshape(chunks, size, *array.shape[1:])
-
-    real = (np.arange(chunks * size) < count).reshape(chunks, size)
-    if len(rows) == 1:
-        parameters = table.rows(rows[0])
-    else:
-        parameters = jax.tree.map(chunked, table.rows(part.material))
-    visual = None if LAWS[law].total else part.F_visual
-    state = _State(part.x, part.v, part.C, part.F, jnp.zeros_like(part.F), part.hardening, visual)
-    state = _mark_nonfinite(jax.tree.map(chunked, state))
-
-    F, rate = (jnp.moveaxis(a, (-2, -1), (0, 1)) for a in (state.F, state.C))
-    matter = respond(law, F, rate, jnp.zeros_like(dt), state.hardening, parameters)
-    F, stress = (jnp.moveaxis(a, (0, 1), (-2, -1)) for a in (matter.F, matter.stress))
-    state = _mark_nonfinite(state._replace(F=F, stress=stress, hardening=matter.hardening))
-    mass, volume = (jnp.where(real, chunked(a), 0.0) for a in (part.mass, part.volume0))
-    return _Group(law, mass, volume, parameters), state
-
-
-def _ungroup(part, state):
-    """Particles with the state that their group has reached."""
-
-    def flat(array):
-        return array.reshape(-1, *array.shape[2:])[: len(part)]
-
-    x, v, C, F, _, hardening, visual = (None if leaf is None else flat(leaf) for leaf in state)
-    return Particles(
-        x,
-        v,
-        F,
-        C,
-        F if visual is None else visual,
-        part.volume0,
-        part.mass,
-        part.material,
-        hardening,
-        part.gaussian,
-        part.counts,
-    )
-
-
-def _reorder(particles, order):
-    return jax.tree.map(lambda a: a[order], particles)
+    return scene, states, restore
 
 
 def _touched_nodes(grid, x, kernel):
@@ -490,14 +376,8 @@ def _touched_nodes(grid, x, kernel):
     return jnp.zeros(grid.shape, bool).at[i, j, k].set(True)
 
 
-def _healthy(dt):
-    none = jnp.zeros((), int)
-    return StepHealth(jnp.full((), jnp.inf, dt.dtype), jnp.zeros((), dt.dtype), none, none, none)
-
-
-def _worse(a, b):
-    merged = jax.tree.map(jnp.maximum, a, b)
-    return eqx.tree_at(lambda health: health.min_J, merged, jnp.minimum(a.min_J, b.min_J))
+def _bounded(states, config):
+    return tuple(bound_visual(state, config.visual_stretch) for state in states)
 
 
 def _block_length(substeps, frames):
@@ -506,8 +386,9 @@ def _block_length(substeps, frames):
     return next(n for n in range(min(substeps, most), 0, -1) if substeps % n == 0)
 
 
-def _like(value, particles):
-    return jnp.asarray(value, particles.x.dtype)
+def _like(tree, particles):
+    """Numbers in the precision of the particles."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, particles.x.dtype), tree)
 
 
 def _is_traced(*trees: Any) -> bool:

@@ -80,7 +80,7 @@ def scatter(
     kernel: Kernel,
     go: Bool[Array, ""],
 ) -> Float[Array, "nx ny nz 4"]:
-    """Add mass [kg] and affine momentum [kg m/s] to the nodes: wᵢ (m, q + B oᵢ), oᵢ the offset from the particle [cells].
+    """Add mass [kg] and affine momentum [kg m/s] to the nodes: wᵢ (m, q + B oᵢ), oᵢ the way from the particle [cells].
 
     `affine` B holds APIC's C and, by MLS-MPM, the stress (Hu et al. 2018, doi 10.1145/3197517.3201293, eq. 16).
     """

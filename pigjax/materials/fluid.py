@@ -11,7 +11,7 @@ _LARGEST_VOLUME = 1.02  # spray forgets further expansion: it must not fall back
 
 
 def tait_pressure(J: Scalars, m) -> Scalars:
-    """p = K/7 (J⁻⁷ − 1) [Pa] (Becker and Teschner 2007, doi 10.2312/SCA/SCA07/209-218); a free surface bears no tension."""
+    """p = K/7 (J⁻⁷ − 1) [Pa], and no tension (Becker and Teschner 2007, doi 10.2312/SCA/SCA07/209-218, eq. 7)."""
     return jnp.maximum(m.bulk / _EXPONENT * (J**-_EXPONENT - 1), 0.0)
 
 

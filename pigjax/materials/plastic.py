@@ -15,7 +15,7 @@ Strains = Float[Array, "3 *n"]
 
 
 def von_mises(strain: Strains, hardening: Scalars, m) -> tuple[Strains, Scalars]:
-    """Radial return to ‖dev τ‖ ≤ √(2/3) σ_y(α), so that σ_y is the uniaxial yield stress (Simo and Hughes 1998, box 3.1).
+    """Radial return to ‖dev τ‖ ≤ √(2/3) σ_y(α), with σ_y the uniaxial yield stress (Simo and Hughes 1998, box 3.1).
 
     σ_y(α) = max(yield_stress + hardening_modulus α, residual_stress), with α the equivalent plastic strain; a negative
     modulus softens.
@@ -35,7 +35,7 @@ def von_mises(strain: Strains, hardening: Scalars, m) -> tuple[Strains, Scalars]
 
 
 def drucker_prager(strain: Strains, hardening: Scalars, m) -> tuple[Strains, Scalars]:
-    """Non-associated return to ‖dev τ‖ + α (tr τ − 3 c cot φ) ≤ 0 (Klar et al. 2016, doi 10.1145/2897824.2925906, sec. 7).
+    """Non-associated return to ‖dev τ‖ + α (tr τ − 3 c cot φ) ≤ 0 (Klar et al. 2016, doi 10.1145/2897824.2925906).
 
     α = √(2/3) 2 sin φ / (3 − sin φ) with φ the friction angle, c the cohesion [Pa]. Matter that pulls apart goes to the
     cone's tip; `hardening` stores the volumetric strain lost there and gives it back before matter resists compression

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 from pigjax.errors import InputError
 from pigjax.materials.table import Material
@@ -10,11 +11,14 @@ from pigjax.materials.table import Material
 # Densities and angles are those of the real matter. Moduli of stiff matter are lowered to what explicit steps afford:
 # its waves are slower, its rest shapes and its flow look the same.
 PRESETS = {
-    "jelly": dict(model="fixed_corotated", density=1000.0, young=2e4, poisson=0.4),
-    "rubber": dict(model="neo_hookean", density=1100.0, young=5e5, poisson=0.45),
-    "metal": dict(model="von_mises", density=2700.0, young=5e6, poisson=0.33, yield_stress=1e5, hardening_modulus=5e4),
-    "plasticine": dict(
-        model="plasticine",
+    "jelly": partial(Material, "fixed_corotated", density=1000.0, young=2e4, poisson=0.4),
+    "rubber": partial(Material, "neo_hookean", density=1100.0, young=5e5, poisson=0.45),
+    "metal": partial(
+        Material, "von_mises", density=2700.0, young=5e6, poisson=0.33, yield_stress=1e5, hardening_modulus=5e4
+    ),
+    "plasticine": partial(
+        Material,
+        "plasticine",
         density=1500.0,
         young=5e5,
         poisson=0.4,
@@ -22,9 +26,11 @@ PRESETS = {
         hardening_modulus=-1e4,
         residual_stress=4e3,
     ),
-    "sand": dict(model="drucker_prager", density=1600.0, young=1e6, poisson=0.3, friction_angle=math.radians(35)),
-    "water": dict(model="fluid", density=1000.0, bulk_modulus=2e5, viscosity=1e-3),
-    "stationary": dict(model="stationary", density=1000.0),
+    "sand": partial(
+        Material, "drucker_prager", density=1600.0, young=1e6, poisson=0.3, friction_angle=math.radians(35)
+    ),
+    "water": partial(Material, "fluid", density=1000.0, bulk_modulus=2e5, viscosity=1e-3),
+    "stationary": partial(Material, "stationary", density=1000.0),
 }
 
 
@@ -36,4 +42,4 @@ def preset(name: str) -> Material:
     """
     if name not in PRESETS:
         raise InputError(f"Preset {name!r} is unknown: choose one of {', '.join(sorted(PRESETS))}.")
-    return Material(**PRESETS[name])
+    return PRESETS[name]()

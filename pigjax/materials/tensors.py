@@ -1,4 +1,4 @@
-"""3x3 algebra on component-first arrays `[3, 3, *n]`, the layout of the laws: one machine vector holds many particles."""
+"""3x3 algebra on component-first arrays `[3, 3, *n]`, as the laws hold them: one machine vector, many particles."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def identity(like: Tensors) -> Float[Array, "3 3 *_"]:
 
 def product(a: Tensors, b: Tensors) -> Tensors:
     """Matrix product."""
-    return sum(a[:, k, None] * b[k] for k in range(3))
+    return a[:, 0, None] * b[0] + a[:, 1, None] * b[1] + a[:, 2, None] * b[2]
 
 
 def transpose(a: Tensors) -> Tensors:

@@ -1,4 +1,4 @@
-"""The state of a simulation: particles, the grid around them, and what its health was."""
+"""The state of a simulation: particles, the grid around them, and the way they went."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from pigjax.arrays import array_field, static_field
-from pigjax.errors import InputError, SimulationError
+from pigjax.errors import InputError
 from pigjax.materials import MaterialTable
 
 WALL = 3  # outer nodes on each side of the grid that belong to the wall of the domain
@@ -27,15 +27,13 @@ class Particles(eqx.Module):
     v: Float[Array, "p 3"] = array_field()  # velocity [m/s]
     F: Float[Array, "p 3 3"] = array_field()  # elastic deformation gradient
     C: Float[Array, "p 3 3"] = array_field()  # velocity gradient, by APIC [1/s]
-    F_visual: Float[Array, "p 3 3"] = array_field()  # total deformation, stretches bounded, for drawing
+    F_visual: Float[Array, "p 3 3"] = array_field()  # total deformation, for drawing
     volume0: Float[Array, "p"] = array_field()  # at rest [m³]
     mass: Float[Array, "p"] = array_field()  # [kg]
     material: Int[Array, "p"] = array_field()  # row of the material table
     hardening: Float[Array, "p"] = array_field()  # internal variable of the plastic laws
     gaussian: Int[Array, "p"] = array_field()  # index of the Gaussian it carries, -1 for none
-    counts: tuple[int, ...] = (
-        static_field()
-    )  # particles of each row: what sizes the groups that the laws are traced for
+    counts: tuple[int, ...] = static_field()  # particles of each row, which sizes the groups by law
 
     def __len__(self) -> int:
         return self.x.shape[0]
@@ -69,57 +67,6 @@ class Trajectory(eqx.Module):
     x: Float[Array, "t p 3"]  # [m]
     v: Float[Array, "t p 3"]  # [m/s]
     F_visual: Float[Array, "t p 3 3"]
-
-
-class StepHealth(eqx.Module):
-    """What went wrong in a step, as data."""
-
-    min_J: Float[Array, ""]  # smallest determinant of F
-    max_courant: Float[Array, ""]  # longest way of a particle in one step [cells]
-    escaped: Int[Array, ""]  # particles that the domain's wall had to hold back, most at one time
-    nonfinite: Int[Array, ""]  # particles lost to NaN or infinity
-    inverted: Int[Array, ""]  # particles turned inside out, most at one time
-
-    def is_bad(self) -> Bool[Array, ""]:
-        """Whether anything is wrong."""
-        return (self.escaped + self.nonfinite + self.inverted > 0) | (self.max_courant >= 1)
-
-    def problems(self) -> list[str]:
-        """What is wrong, one clause each (host)."""
-        found = [
-            (self.nonfinite, "became NaN or infinite"),
-            (self.inverted, "turned inside out (det F <= 0)"),
-            (self.escaped, "left the grid"),
-        ]
-        clauses = [f"{int(count)} particle{'s' * (count != 1)} {what}" for count, what in found if count > 0]
-        if self.max_courant >= 1:
-            clauses.append(f"a particle moved {float(self.max_courant):.2g} cells in one step")
-        return clauses
-
-    def raise_if_bad(self) -> None:
-        """Raise if anything is wrong (host).
-
-        Raises:
-            SimulationError: naming every problem and the remedy.
-        """
-        if clauses := self.problems():
-            raise SimulationError(f"The simulation broke down: {', '.join(clauses)}{self._where()}; {_REMEDY}.")
-
-    def _where(self) -> str:
-        return ""
-
-
-_REMEDY = "take more substeps (or a lower cfl), a larger grid, or softer or slower matter"
-
-
-class Health(StepHealth):
-    """The worst of all steps of a rollout."""
-
-    substeps: Int[Array, ""]  # taken per frame
-    first_bad_frame: Int[Array, ""]  # the first with any problem, -1 for none
-
-    def _where(self) -> str:
-        return f", first in frame {int(self.first_bad_frame)}"
 
 
 def make_particles(
@@ -192,7 +139,7 @@ def fit_grid(x: Float[Array, "p 3"] | np.ndarray, dx: float, *, margin: float = 
     high = np.ceil((finite.max(0) + margin) / dx).astype(int) + WALL
     nx, ny, nz = (_round_up_size(int(n)) for n in high - low + 1)
     low -= (np.array([nx, ny, nz]) - (high - low + 1)) // 2
-    return Grid(jnp.asarray(low * dx, x.dtype), jnp.asarray(dx, x.dtype), (nx, ny, nz))
+    return Grid(jnp.asarray(low * dx, float), jnp.asarray(dx, float), (nx, ny, nz))
 
 
 def _round_up_size(nodes: int) -> int:
