@@ -38,7 +38,7 @@ class Collider(eqx.Module):
     """Base of all colliders.
 
     Modes: "sticky" holds matter, "slip" lets it glide but not leave, "separate" lets it glide with Coulomb friction and
-    leave. A velocity moves the collider from where it was posed at the start of a rollout.
+    leave. A velocity moves the collider during a rollout, from where it is at its start.
 
     Raises:
         InputError: the mode is unknown or the friction negative.
@@ -46,6 +46,7 @@ class Collider(eqx.Module):
 
     friction: Float[Array, ""] = _number(default=0.0, kw_only=True)  # Coulomb's coefficient, for "separate"
     velocity: Float[Array, "3"] | None = _number(default=None, kw_only=True)  # prescribed [m/s]
+    elapsed: Float[Array, ""] = _number(default=0.0, kw_only=True)  # since it was where its shape says [s]
     mode: str = static_field(default="separate", kw_only=True)
 
     def __check_init__(self):
@@ -63,10 +64,14 @@ class Collider(eqx.Module):
         return safe_normalize(jax.grad(lambda p: self.distance(p).sum())(points))
 
     def contact(self, points: Points, time: Float[Array, ""] | float = 0.0) -> Contact:
-        """Which points [m] are inside at a time [s] after the pose, and the normals there."""
+        """Which points [m] are inside a time [s] from now, and the normals there."""
         if self.velocity is not None:
-            points = points - self.velocity * time
+            points = points - self.velocity * (self.elapsed + time)
         return Contact(self.distance(points) < 0, self.normals(points))
+
+    def after(self, duration: Float[Array, ""] | float) -> Collider:
+        """The collider where it will be after a duration [s], to go on from a rollout of that length."""
+        return eqx.tree_at(lambda collider: collider.elapsed, self, self.elapsed + duration)
 
     def apply(self, contact: Contact, velocity: Points) -> Points:
         """Velocities of grid nodes [m/s] after they met the collider."""
