@@ -1,4 +1,4 @@
-"""Held-out PSNR against time on the bundled tabletop: `python benchmarks/bench_reconstruct.py [--steps N] [--out FILE]`."""
+"""Held-out PSNR against time on the bundled tabletop: `python benchmarks/bench_reconstruct.py [--steps N] [--out PLY]`."""
 
 import argparse
 import resource

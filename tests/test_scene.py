@@ -14,11 +14,10 @@ import pytest
 from test_segmentation import load_cloud
 from typer.testing import CliRunner
 
-import pigjax
 from pigjax import io
 from pigjax.cli import app
 from pigjax.errors import InputError, MissingFileError, SceneError, SimulationError
-from pigjax.scene import load_scene, run_scene, scene_from
+from pigjax.scene import load_scene, objects, run_scene, scene_from
 from pigjax.splat import Gaussians
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "tabletop" / "scene.toml"
@@ -209,11 +208,11 @@ def test_report_and_scene_round_trip_as_plain_values(finished):
 def test_info_says_what_files_hold(folder):
     said = CliRunner().invoke(app, ["info", str(folder / "cloud.ply")])
     assert said.exit_code == 0
-    described = pigjax.scene.objects.describe_file(folder / "cloud.ply")
+    described = objects.describe_file(folder / "cloud.ply")
     assert described["Gaussians"] == "400"
     assert described["SH degree"] == "0"
-    assert "duck (jelly)" in pigjax.scene.objects.describe_file(EXAMPLE)["moving"]
-    assert pigjax.scene.objects.describe_file(EXAMPLE.parent)["views"].startswith("40, ")
+    assert "duck (jelly)" in objects.describe_file(EXAMPLE)["moving"]
+    assert objects.describe_file(EXAMPLE.parent)["views"].startswith("40, ")
 
 
 @pytest.mark.parametrize("command", [[], ["demo"], ["run"], ["reconstruct"], ["segment"], ["info"]])
@@ -235,7 +234,7 @@ def test_bad_input_is_exit_code_2_and_one_line(tmp_path):
 def test_segment_writes_labels_objects_and_a_sheet(tmp_path):
     views = io.load_views(EXAMPLE.parent, masks=True, max_size=64)[[0, 5, 10, 15]]
     cloud, _ = load_cloud()
-    counts = pigjax.scene.objects.segment_files(cloud, views, {2: "duck"}, tmp_path, tau_T=0.5, tau_d=0.05, fill=True)
+    counts = objects.segment_files(cloud, views, {2: "duck"}, tmp_path, tau_T=0.5, tau_d=0.05, fill=True)
     assert sum(counts.values()) == len(cloud)
     assert (tmp_path / "objects" / "002_duck.ply").exists()
     assert len(io.load_ply(tmp_path / "objects" / "002_duck.ply")) == counts[2]

@@ -100,6 +100,7 @@ def test_alpha_weighting_sums_alpha_times_transmittance(x64):
     np.testing.assert_allclose(labels.votes, credits, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_alpha_weighting_of_many_ids_equals_that_of_few():
     scene, cameras, masks = make_scene(views=2)
     gaussians = gaussians_of(scene)
@@ -227,6 +228,7 @@ def test_soft_votes_tend_to_the_hard_ones_as_temperature_falls(x64):
     assert errors[0] > errors[1] > errors[2]
 
 
+@pytest.mark.slow
 def test_soft_thresholds_at_their_ends_tend_to_the_hard_ones(x64):
     for tau_T, expected in ((0.0, 0.0), (1.0, 1.0)):
         votes = lift_masks(

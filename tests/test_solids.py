@@ -32,7 +32,7 @@ def table_top(seed=0, count=8000):
 
 @pytest.fixture(scope="module")
 def table():
-    return collider_from_gaussians(gaussians_at(table_top()), spacing=0.01)
+    return collider_from_gaussians(gaussians_at(table_top()), spacing=0.012)
 
 
 def test_distance_from_an_open_table_is_that_of_its_top_also_over_the_hidden_hole(table):
@@ -74,7 +74,7 @@ def test_distance_from_a_sphere_of_oriented_points_converges():
 
 def test_other_up_axis_turns_the_whole_collider():
     points = table_top()[:, [0, 2, 1]] * [1, -1, 1]
-    collider = collider_from_gaussians(gaussians_at(points), spacing=0.01, up=(0.0, -1.0, 0.0))
+    collider = collider_from_gaussians(gaussians_at(points), spacing=0.012, up=(0.0, -1.0, 0.0))
     np.testing.assert_allclose(
         collider.distance(jnp.array([[-0.2, -0.28, 0.1], [-0.2, -0.31, 0.1]])), [-0.02, 0.01], atol=2e-3
     )

@@ -12,7 +12,8 @@ from dense import dense_render
 import pigjax.splat as splat_module
 from pigjax.camera import Camera, look_at
 from pigjax.errors import InputError
-from pigjax.splat import OUTPUTS, Gaussians, RenderConfig, render, required_capacity, surface_depth
+from pigjax.splat import OUTPUTS, Gaussians, RenderConfig, project_splats, render, required_capacity, surface_depth
+from pigjax.tiles import tile_lists
 
 EXACT = RenderConfig(alpha_min=1e-7, transmittance_min=0.0, capacity=60_000)
 
@@ -280,9 +281,18 @@ def test_overflow_is_counted_drops_the_farthest_and_required_capacity_is_enough(
     short = render(gaussians, camera, RenderConfig(capacity=need - 50))
     assert full.overflow == 0
     assert short.overflow == 50
-    order = np.argsort(np.asarray(scene["means"] @ np.asarray(camera.world_to_cam)[2, :3]))
-    near = jax.tree.map(lambda v: v[order[:100]], gaussians)
-    np.testing.assert_allclose(render(near, camera, RenderConfig(capacity=need - 50)).overflow, 0)
+    projected = project_splats(splat_module.as_splats(gaussians), camera, RenderConfig())
+    blending = splat_module.blend_config(camera, RenderConfig(), surface=False)
+
+    def pairs(capacity):
+        lists = tile_lists(projected, blending, capacity)
+        used = np.asarray(lists.tile) < blending.tiles
+        return set(zip(np.asarray(lists.tile)[used].tolist(), np.asarray(lists.splat)[used].tolist()))
+
+    depths, kept = np.asarray(projected.depths), pairs(need - 50)
+    lost = pairs(need) - kept
+    assert lost
+    assert min(depths[s] for _, s in lost) >= max(depths[s] for _, s in kept)
 
 
 def test_two_key_sort_draws_the_same_picture(monkeypatch):

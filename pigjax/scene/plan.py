@@ -160,7 +160,8 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
 
 
 def _still_solids(scene: Scene, inputs: Inputs, labels: Labels) -> dict[str, Collider]:
-    object_id, solids = np.asarray(labels.object_id), {}
+    object_id = np.asarray(labels.object_id)
+    solids: dict[str, Collider] = {}
     for name, entry in scene.objects.items():
         if entry.fixed:
             members = np.flatnonzero(object_id == inputs.ids[name])
