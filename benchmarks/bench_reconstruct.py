@@ -1,4 +1,4 @@
-"""Held-out PSNR against time on the bundled tabletop: `python benchmarks/bench_reconstruct.py [--steps N] [--out PLY]`."""
+"""Held-out PSNR against time on the bundled tabletop: `python benchmarks/bench_reconstruct.py [--steps N]`."""
 
 import argparse
 import resource

@@ -33,11 +33,12 @@ from pigjax.matter import (
     StepHealth,
     Trajectory,
     bound_visual,
+    by_component,
+    by_particle,
     group_by_law,
     mark_nonfinite,
     only_finite,
     perfect_health,
-    select,
 )
 from pigjax.transfers import KERNELS, gather, scatter, stage, stencil
 
@@ -247,12 +248,11 @@ def _particles_to_grid(scene, group, state, nodes):
 
     def chunk(nodes, particles):
         state, mass, volume = particles
-        ok, state = only_finite(state)
+        ok, state = only_finite(by_component(state))
         mass, volume = jnp.where(ok, mass, 0.0), jnp.where(ok, volume, 0.0)
         at = stage(scene.go, partial(stencil, kernel=kernel, shape=scene.grid.shape), _cells(scene.grid, state.x))
-        force = (-scene.dt * kernel.inverse_inertia / dx) * volume * _tensors(state.stress)
-        affine = dx * mass * _tensors(state.C) + force
-        return scatter(nodes, at, mass, mass * state.v.T, affine, kernel, scene.go), None
+        force = (-scene.dt * kernel.inverse_inertia / dx) * volume * state.stress
+        return scatter(nodes, at, mass, mass * state.v, dx * mass * state.C + force, kernel, scene.go), None
 
     return _scan_chunks(chunk, nodes, (state, group.mass, group.volume0))[0]
 
@@ -294,29 +294,28 @@ def _grid_to_particles(scene, group, state, velocity):
 
     def chunk(velocity, particles):
         old, volume, rows = particles
+        old = by_component(old)
         ok, state = only_finite(old)
         at = stage(scene.go, partial(stencil, kernel=kernel, shape=scene.grid.shape), _cells(scene.grid, state.x))
         v, per_cell = gather(velocity, at, kernel, scene.go)
         rate = per_cell / dx
+        law = partial(respond, group.law)
         parameters = group.parameters if one_row else rows
-        matter = respond(group.law, _tensors(state.F), rate, dt, state.hardening, parameters)
-        x = state.x.T + dt * v
+        F, hardening, stress = stage(scene.go, law, state.F, rate, dt, state.hardening, parameters)
+        visual = None if state.F_visual is None else state.F_visual + dt * product(rate, state.F_visual)
+        x = state.x + dt * v
         held = _hold_inside(scene.grid, x)
-        visual = None
-        if state.F_visual is not None:
-            visual = _tensors(state.F_visual)
-            visual = _rows(visual + dt * product(rate, visual))
-        new = State(held.T, v.T, _rows(rate), _rows(matter.F), _rows(matter.stress), matter.hardening, visual)
-        new = mark_nonfinite(select(ok, new, old))
-        alive, J = ok & (volume > 0), determinant(matter.F)
+        new = mark_nonfinite(State(held, v, rate, F, stress, hardening, visual))
+        new = jax.tree.map(lambda new, old: jnp.where(ok, new, old), new, old)
+        alive, J = ok & (volume > 0), determinant(F)
         health = StepHealth(
             min_J=jnp.where(alive, J, jnp.inf).min(),
             max_courant=jnp.sqrt(jnp.where(alive, (v * v).sum(0), 0.0).max()) * dt / dx,
             escaped=(alive & (x != held).any(0)).sum(),
-            nonfinite=((volume > 0) & ~jnp.isfinite(new.x[:, 0])).sum(),
+            nonfinite=((volume > 0) & ~jnp.isfinite(new.x[0])).sum(),
             inverted=(alive & (J <= 0)).sum(),
         )
-        return velocity, (new, jax.tree.map(lax.stop_gradient, health))
+        return velocity, (by_particle(new), jax.tree.map(lax.stop_gradient, health))
 
     _, (state, health) = _scan_chunks(chunk, velocity, (state, group.volume0, None if one_row else group.parameters))
     least, most, *counts = jax.tree.leaves(health)
@@ -327,24 +326,16 @@ def _scan_chunks(chunk, carry, particles):
     return lax.scan(jax.checkpoint(chunk, prevent_cse=False), carry, particles)
 
 
-def _cells(grid, x):
-    """Positions in cells from the first node [3 c], off the outermost layer of cells."""
-    last = jnp.asarray(grid.shape, x.dtype) - 2
-    return jnp.clip((x - grid.origin) / grid.dx, 1, last).T
-
-
 def _hold_inside(grid, x):
     """Positions [3 c] off the outermost layer of cells, where a window would reach over the edge."""
     last = jnp.asarray(grid.shape, x.dtype) - 2
     return jnp.clip(x, (grid.origin + grid.dx)[:, None], (grid.origin + last * grid.dx)[:, None])
 
 
-def _tensors(rows):
-    return jnp.transpose(rows, (1, 2, 0))
-
-
-def _rows(tensors):
-    return jnp.transpose(tensors, (2, 0, 1))
+def _cells(grid, x):
+    """The same in cells from the first node."""
+    last = jnp.asarray(grid.shape, x.dtype) - 2
+    return jnp.clip((x - grid.origin[:, None]) / grid.dx, 1, last[:, None])
 
 
 def _prepare(particles, grid, table, config, dt, gravity, colliders):
@@ -370,7 +361,7 @@ def _prepare(particles, grid, table, config, dt, gravity, colliders):
 
 def _touched_nodes(grid, x, kernel):
     """Nodes in the windows of particles [p 3]."""
-    first = stencil(_cells(grid, x), kernel, grid.shape).first
+    first = stencil(_cells(grid, x.T), kernel, grid.shape).first
     offsets = np.stack(np.meshgrid(*[np.arange(len(kernel.offsets))] * 3, indexing="ij"), -1).reshape(-1, 3)
     i, j, k = jnp.moveaxis(first[:, None] + offsets, -1, 0)
     return jnp.zeros(grid.shape, bool).at[i, j, k].set(True)

@@ -17,19 +17,20 @@ from jaxtyping import Array, Bool, Float
 
 from pigjax import linalg
 from pigjax.materials import LAWS, MaterialTable, Parameters, respond
+from pigjax.materials.tensors import identity
 from pigjax.matter.state import Particles
 
 
 class State(NamedTuple):
-    """What changes of the particles of one law; the leading axes are chunk and particle."""
+    """What changes of the particles of one law; a component's axes stand last, or first after `by_component`."""
 
-    x: Float[Array, "*c 3"]
-    v: Float[Array, "*c 3"]
-    C: Float[Array, "*c 3 3"]
-    F: Float[Array, "*c 3 3"]
-    stress: Float[Array, "*c 3 3"]  # Kirchhoff, of F [Pa]: the return map that finds F finds it too
-    hardening: Float[Array, "*c"]
-    F_visual: Float[Array, "*c 3 3"] | None  # None where F is the total deformation
+    x: Array
+    v: Array
+    C: Array
+    F: Array
+    stress: Array  # Kirchhoff, of F [Pa]: the return map that finds F finds it too
+    hardening: Array
+    F_visual: Array | None  # None where F is the total deformation
 
 
 class Group(NamedTuple):
@@ -74,24 +75,30 @@ def group_by_law(
     return tuple(group for group, _ in pairs), tuple(state for _, state in pairs), still, restore
 
 
-def only_finite(state: State) -> tuple[Bool[Array, "*c"], State]:
-    """Which particles are still finite, and a state at rest in place of the others, whose derivative is zero."""
-    ok = jnp.isfinite(state.x).all(-1)
-    rest = jax.tree.map(jnp.zeros_like, state)
-    rest = rest._replace(F=jnp.broadcast_to(jnp.eye(3, dtype=state.F.dtype), state.F.shape))
-    return ok, select(ok, state, rest)
+def by_component(state: State) -> State:
+    """Particles [c ...] last instead of first, as the laws and the transfers hold them."""
+    return jax.tree.map(lambda array: jnp.moveaxis(array, 0, -1), state)
 
 
-def select(ok: Bool[Array, "*c"], new: State, old: State) -> State:
-    """`new` where ok, `old` elsewhere."""
-    return jax.tree.map(lambda n, o: jnp.where(jnp.expand_dims(ok, tuple(range(ok.ndim, n.ndim))), n, o), new, old)
+def by_particle(state: State) -> State:
+    """Inverse of `by_component`."""
+    return jax.tree.map(lambda array: jnp.moveaxis(array, -1, 0), state)
+
+
+def only_finite(state: State) -> tuple[Bool[Array, "c"], State]:
+    """Which particles are still finite, and a state at rest in place of the others, whose derivative is zero.
+
+    Takes and returns a state by component.
+    """
+    ok = jnp.isfinite(state.x).all(0)
+    rest = jax.tree.map(jnp.zeros_like, state)._replace(F=identity(state.F))
+    return ok, jax.tree.map(lambda leaf, safe: jnp.where(ok, leaf, safe), state, rest)
 
 
 def mark_nonfinite(state: State) -> State:
-    """Position NaN where anything of a particle is not finite."""
-    axis = state.x.ndim - 1
-    total = sum(leaf.sum(range(axis, leaf.ndim)) for leaf in jax.tree.leaves(state))
-    return state._replace(x=jnp.where(jnp.isfinite(total)[..., None], state.x, jnp.nan))
+    """Position NaN where anything of a particle is not finite, in a state by component."""
+    total = sum(leaf.sum(range(leaf.ndim - 1)) for leaf in jax.tree.leaves(state))
+    return state._replace(x=jnp.where(jnp.isfinite(total), state.x, jnp.nan))
 
 
 def bound_visual(state: State, stretch: tuple[float, float]) -> State:
@@ -114,18 +121,18 @@ def _group(law, part, rows, table, limit):
         return jnp.pad(array, padding, mode="edge").reshape(chunks, size, *array.shape[1:])
 
     real = (np.arange(chunks * size) < count).reshape(chunks, size)
-    parameters = table.rows(rows[0]) if len(rows) == 1 else jax.tree.map(chunked, table.rows(part.material))
     mass, volume = (jnp.where(real, chunked(array), 0.0) for array in (part.mass, part.volume0))
+    parameters = table.rows(rows[0] if len(rows) == 1 else part.material)
+
     visual = None if LAWS[law].total else part.F_visual
     state = State(part.x, part.v, part.C, part.F, jnp.zeros_like(part.F), part.hardening, visual)
-    state = mark_nonfinite(jax.tree.map(chunked, state))
-
-    ok, safe = only_finite(state)
-    F, rate = (jnp.moveaxis(array, (-2, -1), (0, 1)) for array in (safe.F, safe.C))
-    matter = respond(law, F, rate, 0.0, safe.hardening, parameters)
-    F, stress = (jnp.moveaxis(array, (0, 1), (-2, -1)) for array in (matter.F, matter.stress))
-    present = state._replace(F=F, stress=stress, hardening=matter.hardening)
-    return Group(law, mass, volume, parameters), mark_nonfinite(select(ok, present, state))
+    ok, state = only_finite(mark_nonfinite(by_component(state)))
+    F, hardening, stress = respond(law, state.F, state.C, 0.0, state.hardening, parameters)
+    state = state._replace(x=jnp.where(ok, state.x, jnp.nan), F=F, hardening=hardening, stress=stress)
+    state = jax.tree.map(chunked, by_particle(mark_nonfinite(state)))
+    if len(rows) > 1:
+        parameters = jax.tree.map(chunked, parameters)
+    return Group(law, mass, volume, parameters), state
 
 
 def _ungroup(part, state):
