@@ -232,11 +232,11 @@ def gradient(mode, inputs):
 )
 def test_derivatives_are_central_differences(mode, relative, taus):
     """To F, quats, log_scales, tau_min, tau_max, lambda_R and lambda_S in turn; step 1e-6 leaves 1e-12 / 1e-6."""
-    inputs = tuple(jnp.asarray(np.asarray(x)) for x in (*ORDINARY, *taus, 1.2, 0.8))
+    inputs = tuple(jnp.asarray(x) for x in (*ORDINARY, *taus, 1.2, 0.8))
     random, step = np.random.default_rng(5), 1e-6
     for chosen in range(len(inputs)):
         direction = [jnp.zeros_like(x) for x in inputs]
-        direction[chosen] = jnp.asarray(np.asarray(random.normal(size=inputs[chosen].shape)))
+        direction[chosen] = jnp.asarray(random.normal(size=inputs[chosen].shape))
         plus, minus = (shape(mode, relative, *(x + h * d for x, d in zip(inputs, direction))) for h in (step, -step))
         slopes = jax.tree.leaves(slope(mode, relative, inputs, tuple(direction)))
         for ours, above, below in zip(slopes, jax.tree.leaves(plus), jax.tree.leaves(minus)):
@@ -261,7 +261,7 @@ def test_derivatives_are_finite_at_every_point(mode):
         for kind, values in scales.items():
             for quats in ([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0], [0.5, 0.5, -0.5, 0.5]):
                 inputs = (F, quats, np.log(values), 0.5, 2.0, 1.2, 0.8)
-                inputs = tuple(jnp.asarray(np.asarray(x), jnp.float32) for x in inputs)
+                inputs = tuple(jnp.asarray(x, jnp.float32) for x in inputs)
                 along_ones = slope(mode, True, inputs, jax.tree.map(jnp.ones_like, inputs))
                 derivatives = jax.tree.leaves((along_ones, gradient(mode, inputs)))
                 assert all(np.isfinite(leaf).all() for leaf in derivatives), f"{name}, {kind}"
