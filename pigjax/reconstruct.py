@@ -23,7 +23,7 @@ from pigjax.camera import Camera
 from pigjax.errors import InputError
 from pigjax.metrics import psnr, ssim
 from pigjax.relocation import relocate, shake
-from pigjax.splat import Gaussians, RenderConfig, render, required_capacity
+from pigjax.splat import Gaussians, RenderConfig, render
 
 _DC = 0.28209479177387814
 
@@ -69,7 +69,6 @@ class Reconstruction:
     psnr: dict[str, float]  # per held-out view [dB]
     ssim: dict[str, float]
     history: list[Progress] = field(default_factory=list)
-    capacity: int = 0  # box/tile pairs that the lists were grown to
     relocated: int = 0
 
     @property
@@ -165,46 +164,35 @@ def reconstruct(
     if checkpoint is not None and checkpoint.exists():
         state = io.load_pytree(checkpoint, state)
 
-    capacity = int(1.25 * required_capacity(state.gaussians, views.cameras, config.render))
     images = jnp.asarray(train.images)
-    result = Reconstruction(state.gaussians, {}, {}, capacity=capacity)
+    result = Reconstruction(state.gaussians, {}, {})
     begun = time.perf_counter()
     while (step := int(state.step)) < config.steps:
         stop = min(config.steps, _next_multiple(step, config.relocate_every, config.evaluate_every, 50))
-        settings = _with_capacity(config, capacity)
-        moved, loss, overflow = _train(state, train.cameras, images, settings, optimizer, extent, stop - step)
-        if overflow > 0:
-            capacity = max(int(1.5 * capacity), required_capacity(moved.gaussians, views.cameras, config.render))
-            continue
-        state = moved
+        state, loss = _train(state, train.cameras, images, config, optimizer, extent, stop - step)
         if config.relocate_every and stop % config.relocate_every == 0 and stop <= config.relocate_until * config.steps:
             state = _relocate(state, config)
         score = None
         if stop % config.evaluate_every == 0 or stop == config.steps:
-            score = _score(state.gaussians, held_out, settings)[0]
+            score = _score(state.gaussians, held_out, config)[0]
             if checkpoint is not None:
                 io.save_pytree(checkpoint, state)
         mean = None if score is None else float(np.mean(list(score.values()))) if score else None
         result.history.append(Progress(stop, float(loss), mean, time.perf_counter() - begun))
         if callback is not None:
             callback(result.history[-1])
-    psnrs, ssims = _score(state.gaussians, held_out, _with_capacity(config, capacity))
+    psnrs, ssims = _score(state.gaussians, held_out, config)
     return replace(
         result,
         gaussians=state.gaussians,
         psnr=psnrs,
         ssim=ssims,
-        capacity=capacity,
         relocated=int(state.relocated),
     )
 
 
 def _next_multiple(step: int, *periods: int) -> int:
     return min((step // p + 1) * p for p in periods if p)
-
-
-def _with_capacity(config: FitConfig, capacity: int) -> FitConfig:
-    return replace(config, render=replace(config.render, capacity=capacity))
 
 
 def _optimizer(config: FitConfig, extent: float) -> optax.GradientTransformation:
@@ -236,12 +224,12 @@ def _loss(gaussians: Gaussians, camera: Camera, image: Float[Array, "h w 3"], co
         loss += config.ssim_weight * (1 - ssim(frame.rgb, image))
     loss += config.opacity_regularizer * jnp.mean(jax.nn.sigmoid(gaussians.logit_opacities))
     loss += config.scale_regularizer / extent * jnp.mean(jnp.exp(gaussians.log_scales))
-    return loss, frame.overflow
+    return loss
 
 
 @eqx.filter_jit
 def _train(state: FitState, cameras: Camera, images, config: FitConfig, optimizer, extent: float, count: int):
-    """`count` steps: the state after them, their mean loss, and the most list entries that were dropped."""
+    """`count` steps: the state after them, and their mean loss."""
     views = images.shape[0]
 
     def one(state: FitState, _):
@@ -250,19 +238,17 @@ def _train(state: FitState, cameras: Camera, images, config: FitConfig, optimize
         order = jax.random.permutation(jax.random.fold_in(jax.random.key(config.seed + 1), state.step // views), views)
         view = order[state.step % views]
         camera = cameras[view]
-        (loss, overflow), gradient = eqx.filter_value_and_grad(_loss, has_aux=True)(
-            state.gaussians, camera, images[view], config, extent
-        )
+        loss, gradient = eqx.filter_value_and_grad(_loss)(state.gaussians, camera, images[view], config, extent)
         updates, moments = optimizer.update(gradient, state.optimizer, state.gaussians)
         updates = eqx.tree_at(lambda g: g.sh, updates, updates.sh * _band_rates(state.step, config))
         gaussians = optax.apply_updates(state.gaussians, updates)
         if config.noise:
             rate = config.means_rate * extent * 0.01 ** (state.step / config.steps)
             gaussians = shake(gaussians, key, config.noise * rate)
-        return FitState(gaussians, moments, state.step + 1, state.relocated), (loss, overflow)
+        return FitState(gaussians, moments, state.step + 1, state.relocated), loss
 
-    state, (loss, overflow) = lax.scan(one, state, length=count)
-    return state, jnp.mean(loss), jnp.max(overflow)
+    state, loss = lax.scan(one, state, length=count)
+    return state, jnp.mean(loss)
 
 
 @eqx.filter_jit

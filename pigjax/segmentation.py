@@ -55,8 +55,9 @@ def lift_masks(
     that pixel if |z - d| <= tau_d·d. Behind the near plane, outside the image or without a surface it has no vote.
 
     Views are streamed: memory is one [n num_ids] array of counts, in the narrowest integer that holds the views.
-    `vmap` over `tau_T` and `tau_d` sweeps them. Outside `jit` the renderer gets the capacity that the cameras need;
-    inside, or where `config.capacity` is set, that capacity holds and `Labels.overflow` counts what was dropped.
+    `vmap` over `tau_T` and `tau_d` sweeps them. Soft votes and ties by alpha walk lists of a static capacity, outside
+    `jit` the one that the cameras need; inside, or where `config.capacity` is set, `Labels.overflow` counts what was
+    dropped.
 
     Args:
         gaussians: the scene.
@@ -96,12 +97,13 @@ def lift_masks(
     dtype = gaussians.means.dtype
     temperature = None if temperature is None else jnp.asarray(temperature, dtype)
     thresholds = jnp.asarray(tau_T, dtype), jnp.asarray(tau_d, dtype), temperature
-    config = enough_capacity(gaussians, cameras, config)
+    settled = weighting == "centre" and temperature is None and ties == "alpha"
     splats, masks = as_splats(gaussians), jnp.asarray(masks)
-    votes, overflow = _collect(splats, cameras, masks, thresholds, num_ids, weighting, config)
-    counted = weighting == "centre" and temperature is None
-    rerun = jax.tree_util.Partial(_credit_candidates, splats, cameras, masks, config)
-    object_id, confidence = _elect(votes, background, min_votes, purity, rerun if counted and ties == "alpha" else None)
+    walks = enough_capacity(gaussians, cameras, config) if settled or temperature is not None else config
+    drawn = config if temperature is None else walks
+    votes, overflow = _collect(splats, cameras, masks, thresholds, num_ids, weighting, drawn)
+    rerun = jax.tree_util.Partial(_credit_candidates, splats, cameras, masks, walks)
+    object_id, confidence = _elect(votes, background, min_votes, purity, rerun if settled else None)
     return Labels(object_id, votes, confidence, overflow)
 
 
@@ -123,7 +125,7 @@ def object_mask(
         camera: a single camera.
         mode: "isolated" draws the object's Gaussians alone, also where others hide it; "visible" is the object's share
             of the pixel in the whole scene.
-        config: the renderer's settings. Outside `jit` a capacity of None becomes what the camera needs.
+        config: the renderer's settings.
 
     Raises:
         InputError: unknown mode.
@@ -133,8 +135,7 @@ def object_mask(
     member = (labels.object_id == object_id).astype(splats.opacities.dtype)
     if mode == "isolated":
         alone = dataclasses.replace(splats, opacities=splats.opacities * member)
-        return _draw("alpha", alone, camera, enough_capacity(alone, camera, config))[0]
-    config = enough_capacity(splats, camera, config)
+        return _draw("alpha", alone, camera, config)[0]
     return _draw("object_weights", splats, camera, config, object_weights=member[:, None])[0][..., 0]
 
 

@@ -11,10 +11,12 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from pigjax.arrays import array_field, static_field
+from pigjax.bands import collect, spread
 from pigjax.camera import Camera, stack_cameras, to_camera
 from pigjax.errors import InputError
 from pigjax.linalg import quat_to_matrix, safe_normalize
-from pigjax.tiles import BlendConfig, Projected, blend, tile_boxes, tile_lists
+from pigjax.lists import BlendConfig, Projected, count_pairs, slots_of, tile_boxes
+from pigjax.tiles import blend
 
 
 class Gaussians(eqx.Module):
@@ -60,9 +62,8 @@ class RenderConfig(eqx.Module):
     """Every approximation of the renderer, static."""
 
     tile_size: int = static_field(default=16)  # [px]
-    capacity: int | None = static_field(
-        default=None
-    )  # box/tile pairs that fit; None: 16 per splat, at least 4 per tile
+    capacity: int | None = static_field(default=None)  # box/tile pairs listed for an image; None: all that are seen
+    slots: int | None = static_field(default=None)  # of them sorted at once; None: 2¹⁷ on a CPU, 2²¹ elsewhere, / bands
     sh_degree: int | None = static_field(default=None)  # None: all bands that the splats have
     alpha_min: float = static_field(default=1 / 255)  # fainter contributions are skipped
     alpha_max: float = static_field(default=0.99)
@@ -70,7 +71,9 @@ class RenderConfig(eqx.Module):
     dilation: float = static_field(default=0.3)  # added to the 2D covariance [px²]
     antialias: bool = static_field(default=False)  # lower the opacity by what the dilation added
     near: float = static_field(default=0.01)  # [m]
-    chunk: int = static_field(default=32)  # splats blended between two looks at whether the tile is opaque
+    chunk: int = static_field(default=64)  # splats blended between two looks at whether the tile is opaque
+    tiles_at_once: int | None = static_field(default=None)  # walked together; None: 1 on a CPU, 2048 elsewhere
+    bands: int = static_field(default=1)  # local devices that share the image, each a band of rows
     differentiation: str = static_field(default="reverse")  # "forward" for jvp and hessians
 
 
@@ -127,14 +130,14 @@ def render(
 
 @eqx.filter_jit
 def _render(gaussians_or_splats, camera, config, background, outputs, object_weights, tau_T) -> Frame:
-    splats = as_splats(gaussians_or_splats)
+    splats = as_splats(spread(gaussians_or_splats, config.bands))
     if len(splats) == 0:
         # gathers need a row: one splat of opacity 0 draws nothing
         splats, object_weights = jax.tree.map(lambda v: jnp.zeros((1, *v.shape[1:]), v.dtype), (splats, object_weights))
     features = []
     if "rgb" in outputs:
         features.append(colours(splats, camera, config.sh_degree))
-    blending = blend_config(camera, config, surface="surface_depth" in outputs)
+    blending = blend_config(camera, config, len(splats), surface="surface_depth" in outputs)
     projected = project_splats(splats, camera, config)
     if "depth" in outputs:
         features.append(projected.depths[:, None])
@@ -142,16 +145,15 @@ def _render(gaussians_or_splats, camera, config, background, outputs, object_wei
         features.append(object_weights)
     dtype = projected.depths.dtype
     table = jnp.concatenate(features, 1) if features else jnp.zeros((len(splats), 0), dtype)
-    lists = tile_lists(lax.stop_gradient(projected), blending, capacity_of(config, len(splats), blending))
+    projected, table = collect((projected, table), config.bands)
     reverse = config.differentiation == "reverse"
-    transmittance, image, surface = blend(projected, table, lists, blending, tau_T, reverse=reverse)
+    alpha, image, surface, overflow = blend(projected, table, blending, tau_T, reverse=reverse)
 
-    frame = {"overflow": lists.overflow, "alpha": 1 - transmittance if "alpha" in outputs else None}
+    frame = {"overflow": overflow, "alpha": alpha if "alpha" in outputs else None}
     if "rgb" in outputs:
-        frame["rgb"] = image[..., :3] + transmittance[..., None] * background
+        frame["rgb"] = image[..., :3] + (1 - alpha)[..., None] * background
         image = image[..., 3:]
     if "depth" in outputs:
-        alpha = 1 - transmittance
         frame["depth"] = jnp.where(alpha > 0, image[..., 0] / jnp.where(alpha > 0, alpha, 1.0), 0.0)
         image = image[..., 1:]
     if "object_weights" in outputs:
@@ -175,7 +177,7 @@ def surface_depth(
 
 
 def required_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: RenderConfig = RenderConfig()) -> int:  # noqa: B008
-    """Box/tile pairs that the fullest of these cameras needs, host. A capacity at least this large never overflows."""
+    """Box/tile pairs that the fullest of these cameras has, host. A capacity at least this large never overflows."""
     splats = as_splats(gaussians)
     batch = cameras if cameras.world_to_cam.ndim == 3 else stack_cameras([cameras])
     return int(_most_pairs(splats, batch, config))
@@ -184,28 +186,32 @@ def required_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: Re
 @eqx.filter_jit
 def _most_pairs(splats: Splats, cameras: Camera, config: RenderConfig) -> Int[Array, ""]:
     def pairs(camera: Camera) -> Int[Array, ""]:
-        _, box = tile_boxes(project_splats(splats, camera, config), blend_config(camera, config, surface=False))
-        return jnp.sum(box[:, 0] * box[:, 1])
+        blending = blend_config(camera, config, len(splats), surface=False)
+        _, box = tile_boxes(project_splats(splats, camera, config), blending)
+        return count_pairs(box[:, 0] * box[:, 1])
 
     return jnp.max(lax.map(pairs, cameras))
 
 
-def capacity_of(config: RenderConfig, count: int, blending: BlendConfig) -> int:
-    """Slots of the tile lists, a static number."""
-    return config.capacity if config.capacity is not None else max(16 * count, 4 * blending.tiles)
-
-
-def blend_config(camera: Camera, config: RenderConfig, *, surface: bool) -> BlendConfig:
-    """What the blending loop needs of the camera and the settings."""
+def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: bool) -> BlendConfig:
+    """What listing and blending need of the camera, the number of splats and the settings."""
+    on_cpu = jax.default_backend() == "cpu"
+    tiles = -(-camera.width // config.tile_size) * -(-camera.height // config.tile_size)
+    limit = config.slots or 2 ** (17 if on_cpu else 21) // config.bands
     return BlendConfig(
-        camera.width,
-        camera.height,
-        config.tile_size,
-        config.chunk,
-        config.alpha_min,
-        config.alpha_max,
-        config.transmittance_min,
-        surface,
+        width=camera.width,
+        height=camera.height,
+        tile=config.tile_size,
+        chunk=config.chunk,
+        slots=slots_of(count, tiles, config.capacity, limit),
+        capacity=config.capacity,
+        tiles_at_once=config.tiles_at_once or (1 if on_cpu else 2048),
+        bands=config.bands,
+        alpha_min=config.alpha_min,
+        alpha_max=config.alpha_max,
+        transmittance_min=config.transmittance_min,
+        near=config.near,
+        surface=surface,
     )
 
 
@@ -277,7 +283,10 @@ def project_splats(splats: Splats, camera: Camera, config: RenderConfig) -> Proj
         a, c = a + config.dilation, c + config.dilation
     # a needle's a·c and b·b cancel in float32; the dilated determinant is at least dilation²
     tiny = float(jnp.finfo(a.dtype).tiny)
-    determinant = jnp.maximum(a * c - b * b, max(config.dilation**2, tiny))
+    least = max(config.dilation**2, tiny)
+    widest = jnp.sqrt(jnp.maximum(a * c - least, tiny))
+    b = jnp.clip(b, -widest, widest)
+    determinant = jnp.maximum(a * c - b * b, least)
     conics = jnp.stack([c, -b, a], 1) / determinant[:, None]
     centres = jnp.stack([fx * u + cx, fy * v + cy], 1)
 

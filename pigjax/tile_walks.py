@@ -15,11 +15,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Integer
 
 from pigjax.camera import Camera
-from pigjax.splat import RenderConfig, Splats, blend_config, capacity_of, project_splats
-from pigjax.tiles import BlendConfig, TileLists, _alphas, _pixels, tile_lists
+from pigjax.lists import SHAPE_COLUMNS, BlendConfig, Boxes, TileLists, count_pairs, front_to_back, list_pass
+from pigjax.splat import RenderConfig, Splats, blend_config, project_splats
+from pigjax.tiles import as_tiles_see, tile_alphas
 
 _LEAST_PRESENCE = 1e-6  # below it a pixel has no surface; keeps its square within float32
-_DEPTH = 6  # column of the chunk's rows that holds camera z
+_DEPTH = -1  # column of the chunk's rows that holds camera z
 
 
 class Chunks(eqx.Module):
@@ -29,7 +30,7 @@ class Chunks(eqx.Module):
     first: Bool[Array, "c"]  # the chunk opens its tile
     splat: Int[Array, "c k"]
     valid: Bool[Array, "c k"]
-    rows: Float[Array, "c k 7"]  # x, y, conic xx xy yy, opacity, camera z
+    rows: Float[Array, "c k 7"]  # of `tiles.as_tiles_see`, camera z last
 
 
 def soft_surface_depth(
@@ -95,23 +96,28 @@ def credits_of_candidates(
 
 
 def _chunks_seen(splats: Splats, camera: Camera, config: RenderConfig) -> tuple[Chunks, BlendConfig, Int[Array, ""]]:
+    """Lists of all splats in one pass: these walks have no early end that could spare the hidden ones."""
     projected = project_splats(splats, camera, config)
-    blending = blend_config(camera, config, surface=True)
-    lists = tile_lists(lax.stop_gradient(projected), blending, capacity_of(config, len(splats), blending))
-    columns = [projected.centres, projected.conics, projected.opacities[:, None], projected.depths[:, None]]
-    return _cut(jnp.concatenate(columns, 1), lists, blending), blending, lists.overflow
+    blending = blend_config(camera, config, len(splats), surface=True)
+    boxes = front_to_back(lax.stop_gradient(projected), blending)
+    slots = config.capacity if config.capacity is not None else max(16 * len(splats), 4 * blending.tiles)
+    table = jnp.concatenate([projected.shapes, projected.depths[:, None]], 1)[boxes.order]
+    lists = list_pass(lax.stop_gradient(table[:, :SHAPE_COLUMNS]), boxes, 0, None, blending, slots)
+    overflow = count_pairs(boxes.size[:, 0] * boxes.size[:, 1]) - lists.listed
+    return _cut(table, boxes, lists, blending), blending, overflow
 
 
-def _cut(table: Float[Array, "n 7"], lists: TileLists, config: BlendConfig) -> Chunks:
+def _cut(table: Float[Array, "n 7"], boxes: Boxes, lists: TileLists, config: BlendConfig) -> Chunks:
     counts = -(-(lists.start[1:] - lists.start[:-1]) // config.chunk)
     end = jnp.cumsum(counts)
-    index = jnp.arange(-(-lists.splat.shape[0] // config.chunk) + config.tiles)
+    index = jnp.arange(-(-lists.rank.shape[0] // config.chunk) + config.tiles)
     tile = jnp.minimum(jnp.searchsorted(end, index, side="right"), config.tiles - 1).astype(jnp.int32)
     within = index - (end - counts)[tile]
     entry = (lists.start[tile] + within * config.chunk)[:, None] + jnp.arange(config.chunk)
     valid = entry < lists.start[tile + 1][:, None]
-    splat = lists.splat[jnp.where(valid, entry, 0)]
-    return Chunks(tile, within == 0, splat, valid, table[splat])
+    rank = lists.rank[jnp.where(valid, entry, 0)]
+    rows = as_tiles_see(table[rank.ravel()], jnp.repeat(tile, config.chunk), config)
+    return Chunks(tile, within == 0, boxes.order[rank], valid, rows.reshape(*rank.shape, -1))
 
 
 def _walk(chunks: Chunks, needed: Bool[Array, "c"], config: BlendConfig, visit: Callable):
@@ -125,8 +131,7 @@ def _walk(chunks: Chunks, needed: Bool[Array, "c"], config: BlendConfig, visit: 
     result = jax.eval_shape(visit, one_chunk, planes, planes, planes)
 
     def blend_chunk(transmittance, chunk: Chunks):
-        x, y = _pixels(chunk.tile, config, dtype)
-        alpha, _ = _alphas(chunk.rows, x, y, chunk.valid, config)
+        alpha, _ = tile_alphas(chunk.rows, chunk.valid, config)
         _, after = lax.scan(lambda t, a: (t * (1 - a),) * 2, transmittance, alpha)
         before = jnp.concatenate([transmittance[None], after[:-1]])
         return after[-1], visit(chunk, alpha, before, after)

@@ -1,326 +1,301 @@
-"""The tile compositor under `splat.render`: depth-sorted lists per tile, blended front to back.
+"""The tile compositor under `splat.render`: splats blended front to back, tile by tile.
 
-Lists have a static capacity; what does not fit is counted. Blending walks each tile's list in chunks of `chunk` splats
-and leaves a tile as soon as all its pixels are opaque, so time and memory grow with the entries of the lists, never
-with pixels x splats. The backward pass walks the same lists front to back again: with the pixel's total known from the
-forward pass, what lies behind a splat is total minus prefix, so no per-splat state is stored.
+Each pass of `lists.list_pass` is blended on top of what the passes before it left. A tile walks its list in chunks and
+leaves as soon as all its pixels are opaque, so time grows with the pairs that are seen, and memory with splats, pixels
+and the slots of one pass, never with pixels x splats. The backward pass walks the same way, front to back: with the
+pixel's total known from the forward pass, what lies behind a splat is total minus prefix, so nothing is stored.
+
+Opacity is tracked as the plain product of all (1 - alpha), which falls below `transmittance_min` at the splat that
+closes a pixel and stays there; a splat counts only if the product is above it afterwards. That equals closing the pixel
+for good, without a flag.
 """
 
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from pigjax.arrays import static_field
+from pigjax.bands import in_bands
+from pigjax.lists import (
+    SHAPE_COLUMNS,
+    BlendConfig,
+    Boxes,
+    Projected,
+    count_pairs,
+    front_to_back,
+    list_pass,
+    pairs_in_open_tiles,
+)
 
-_KEY_LIMIT = 2**31  # tile and depth rank share one int32 sort key below it
-_SHAPE_COLUMNS = 6  # table of the blending loop: x, y, conic xx xy yy, opacity, then the features
+_TERMS = 6  # of a polynomial of degree two in the plane
+_NOWHERE = np.array([-1e4, 0, 0, 0, 0, 0])  # polynomial of a splat whose alpha is 0
 
-
-class Projected(eqx.Module):
-    """Splats on the image plane."""
-
-    centres: Float[Array, "n 2"]  # [px]
-    conics: Float[Array, "n 3"]  # inverse 2D covariance, entries xx, xy, yy [1/px²]
-    opacities: Float[Array, "n"]
-    depths: Float[Array, "n"]  # camera z [m]
-    radii: Float[Array, "n 2"]  # half extents of the box outside which alpha < alpha_min [px]
-    visible: Bool[Array, "n"]
-
-
-class TileLists(eqx.Module):
-    """Which splats each tile blends, in order: tile t owns `splat[start[t]:start[t + 1]]`."""
-
-    splat: Int[Array, "capacity"]
-    tile: Int[Array, "capacity"]  # number of tiles in slots that no tile owns
-    start: Int[Array, "tiles_plus_1"]
-    overflow: Int[Array, ""]  # box/tile pairs beyond the capacity, dropped far splats first
+# accelerators round float32 factors to TF32 unless told otherwise
+_product = functools.partial(jnp.matmul, precision=lax.Precision.HIGHEST)
 
 
-class BlendConfig(eqx.Module):
-    """What the blending loop needs to know at trace time."""
+class Blended(NamedTuple):
+    """What `blend` returns."""
 
-    width: int = static_field()
-    height: int = static_field()
-    tile: int = static_field()
-    chunk: int = static_field()
-    alpha_min: float = static_field()
-    alpha_max: float = static_field()
-    transmittance_min: float = static_field()
-    surface: bool = static_field()  # also return the depth at which transmittance falls below a threshold
-
-    @property
-    def columns(self) -> int:
-        """Tiles per image row."""
-        return -(-self.width // self.tile)
-
-    @property
-    def tiles(self) -> int:
-        """Tiles of the image."""
-        return self.columns * -(-self.height // self.tile)
-
-
-def tile_boxes(projected: Projected, config: BlendConfig) -> tuple[Int[Array, "n 2"], Int[Array, "n 2"]]:
-    """First tile and number of tiles, along x and y, of each splat's bounding box; no tiles for invisible splats."""
-    limit = jnp.array([config.columns, -(-config.height // config.tile)], projected.centres.dtype)
-    low = jnp.clip(jnp.floor((projected.centres - projected.radii) / config.tile), 0, limit).astype(jnp.int32)
-    high = jnp.clip(jnp.floor((projected.centres + projected.radii) / config.tile) + 1, 0, limit).astype(jnp.int32)
-    return low, jnp.where(projected.visible[:, None], jnp.maximum(high - low, 0), 0)
-
-
-def tile_lists(projected: Projected, config: BlendConfig, capacity: int) -> TileLists:
-    """Splats of each tile in depth order, equal depths by index.
-
-    Box/tile pairs are laid out in depth order up to the capacity, so that overflow drops the farthest first; pairs
-    whose splat cannot reach alpha_min anywhere in the tile are culled exactly; the rest are sorted by (tile, depth).
-    """
-    count, tile = projected.depths.shape[0], config.tile
-    order = jnp.argsort(jnp.where(projected.visible, projected.depths, jnp.inf), stable=True).astype(jnp.int32)
-    low, box = (values[order] for values in tile_boxes(projected, config))
-    pairs = box[:, 0] * box[:, 1]
-    end = jnp.cumsum(pairs)
-    total = end[-1] if count else jnp.zeros((), jnp.int32)
-
-    slots = jnp.arange(capacity, dtype=jnp.int32)
-    rank = jnp.repeat(jnp.arange(count, dtype=jnp.int32), pairs, total_repeat_length=capacity)
-    within = slots - (end - pairs)[rank]
-    across = jnp.maximum(box[rank, 0], 1)
-    tile_x, tile_y = low[rank, 0] + within % across, low[rank, 1] + within // across
-    splat = order[rank]
-    reach = _largest_alpha(projected, splat, tile_x * tile, tile_y * tile, tile)
-    kept = (slots < total) & (reach >= config.alpha_min * 0.999)
-
-    tile_index = jnp.where(kept, tile_y * config.columns + tile_x, config.tiles)
-    if (config.tiles + 1) * count < _KEY_LIMIT:
-        key = lax.sort(tile_index * count + rank, is_stable=False)
-        tile_index, rank = key // max(count, 1), key % max(count, 1)
-    else:
-        # one int32 key would wrap: sort lexicographically, which costs about three times as much
-        tile_index, rank = lax.sort((tile_index, rank), num_keys=2, is_stable=False)
-    start = jnp.searchsorted(tile_index, jnp.arange(config.tiles + 1, dtype=jnp.int32)).astype(jnp.int32)
-    return TileLists(order[rank], tile_index, start, jnp.maximum(total - capacity, 0))
-
-
-def _largest_alpha(projected: Projected, splat, left, top, tile: int):
-    """Largest alpha that a splat reaches on the pixel centres of a tile: the conic's minimum over a rectangle."""
-    a, b, c = projected.conics[splat].T
-    x, y = projected.centres[splat].T
-    x0, y0 = left + 0.5 - x, top + 0.5 - y
-    x1, y1 = x0 + (tile - 1), y0 + (tile - 1)
-
-    def power(u, v):
-        return 0.5 * (a * u * u + c * v * v) + b * u * v
-
-    def along_y(u):
-        return power(u, jnp.clip(-b * u / c, y0, y1))
-
-    def along_x(v):
-        return power(jnp.clip(-b * v / a, x0, x1), v)
-
-    inside = (x0 <= 0) & (x1 >= 0) & (y0 <= 0) & (y1 >= 0)
-    edge = jnp.minimum(jnp.minimum(along_y(x0), along_y(x1)), jnp.minimum(along_x(y0), along_x(y1)))
-    return projected.opacities[splat] * jnp.exp(-jnp.where(inside, 0.0, edge))
+    alpha: Float[Array, "h w"]
+    features: Float[Array, "h w c"]  # sums of features weighted by alpha·T
+    surface: Float[Array, "h w"] | None  # depth [m] of the splat that takes transmittance below tau, 0 for none
+    overflow: Int[Array, ""]  # box/tile pairs beyond the capacity, far splats dropped first
 
 
 def blend(
     projected: Projected,
     features: Float[Array, "n c"],
-    lists: TileLists,
     config: BlendConfig,
     tau: Float[Array, ""] | float = 0.5,
     *,
     reverse: bool = True,
-) -> tuple[Float[Array, "h w"], Float[Array, "h w c"], Float[Array, "h w"] | None]:
+) -> Blended:
     """Blend features front to back.
 
     Args:
         projected: splats on the image plane.
         features: what is summed with weight alpha·T, any number of channels.
-        lists: splats per tile.
-        config: image size and thresholds.
+        config: image size, thresholds and static sizes.
         tau: transmittance below which a pixel's surface lies; its derivative is zero.
         reverse: use the hand-written backward pass; False leaves a loop that forward mode can differentiate.
-
-    Returns:
-        Transmittance that is left, blended features, and the depth of the splat whose blend takes the transmittance
-        below `tau` (0 where none does), or None when `config.surface` is off.
     """
-    shape = jnp.concatenate([projected.centres, projected.conics, projected.opacities[:, None]], 1)
+    boxes = front_to_back(lax.stop_gradient(projected), config)
     extra = [projected.depths[:, None]] if config.surface else []
-    table = jnp.concatenate([shape, features, *extra], 1)
+    ones = jnp.ones_like(projected.depths)[:, None]
+    table = jnp.concatenate([projected.shapes, features, ones, *extra], 1)[boxes.order]
     tau = lax.stop_gradient(jnp.asarray(tau, table.dtype))
     composite = _composite if reverse else _forward
-    planes = composite(table, lists, tau, config)
-    rows = config.tiles // config.columns
-    image = planes.reshape(rows, config.columns, -1, config.tile, config.tile).transpose(0, 3, 1, 4, 2)
-    image = image.reshape(rows * config.tile, config.columns * config.tile, -1)[: config.height, : config.width]
-    channels = features.shape[1]
-    return image[..., 0], image[..., 1 : 1 + channels], image[..., -1] if config.surface else None
+    planes, overflow = (composite if config.bands == 1 else in_bands(composite))(table, boxes, tau, config)
+    image = planes.reshape(-1, config.columns, planes.shape[1], config.tile, config.tile).transpose(0, 3, 1, 4, 2)
+    image = image.reshape(-1, config.columns * config.tile, planes.shape[1])
+    image, channels = image[: config.height, : config.width], features.shape[1]
+    return Blended(image[..., channels], image[..., :channels], image[..., -1] if config.surface else None, overflow)
 
 
-def _pixels(tile, config: BlendConfig, dtype):
-    index = jnp.arange(config.tile**2, dtype=jnp.int32)
-    x = (tile % config.columns) * config.tile + index % config.tile
-    y = (tile // config.columns) * config.tile + index // config.tile
-    return x.astype(dtype) + 0.5, y.astype(dtype) + 0.5
+def as_tiles_see(rows: Float[Array, "s k"], tile: Int[Array, "s"], config: BlendConfig) -> Float[Array, "s k"]:
+    """Rows for `tile_alphas`: the exponent of each Gaussian as a polynomial about the centre of a tile.
 
-
-def _alphas(rows, x, y, valid, config: BlendConfig):
-    """Alpha of each splat of a chunk at each pixel, and whether the alpha_max clamp is off."""
-    dx, dy = x - rows[:, 0:1], y - rows[:, 1:2]
-    a, b, c = rows[:, 2:3], rows[:, 3:4], rows[:, 4:5]
-    power = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-    unclamped = rows[:, 5:6] * jnp.exp(-power)
-    alpha = jnp.minimum(unclamped, config.alpha_max)
-    blended = (alpha >= config.alpha_min) & (power >= 0) & valid[:, None]
-    return jnp.where(blended, alpha, 0.0), unclamped < config.alpha_max
-
-
-def _attenuate(transmittance, alpha, config: BlendConfig):
-    """Blend one splat: its weight, and the transmittance behind it.
-
-    A splat that would take the transmittance below the floor is not blended and closes the pixel for good; a closed
-    pixel keeps its transmittance with the sign turned, which spares a flag in the carry.
+    Columns: coefficients of 1, x, y, xx, xy, yy; then the features.
     """
-    behind = transmittance * (1 - alpha)
-    stop = behind <= config.transmittance_min
-    weight = jnp.where(stop, 0.0, alpha * transmittance)
-    closing = stop & (transmittance > 0) & (alpha > 0)
-    return weight, jnp.where(closing, -transmittance, jnp.where(stop, transmittance, behind)), stop
+    x, y, a, b, c, peak = rows[:, :SHAPE_COLUMNS].T
+    half = config.tile / 2
+    dx = (tile % config.columns * config.tile).astype(rows.dtype) + half - x
+    dy = (tile // config.columns * config.tile).astype(rows.dtype) + half - y
+    at_centre = peak - (0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy)
+    polynomial = jnp.stack([at_centre, -(a * dx + b * dy), -(b * dx + c * dy), -0.5 * a, -b, -0.5 * c], 1)
+    return jnp.concatenate([polynomial, rows[:, SHAPE_COLUMNS:]], 1)
 
 
-def _crosses(before, alpha, tau):
-    return (before >= tau) & (before * (1 - alpha) < tau)
+def tile_alphas(rows, valid, config: BlendConfig):
+    """Alpha [chunk pixels] of each splat at each pixel of a tile, and its value before the alpha_max clamp."""
+    # a product, since XLA would read the list anew for every pixel of a sum
+    polynomial = jnp.where(valid[:, None], rows[:, :_TERMS], jnp.asarray(_NOWHERE, rows.dtype))
+    exponent = _product(polynomial, _monomials(config, rows.dtype))
+    unclamped = jnp.exp(exponent)
+    alpha = jnp.minimum(unclamped, config.alpha_max)
+    return jnp.where(alpha >= config.alpha_min, alpha, 0.0), unclamped
 
 
-def _chunks(table, splat, config: BlendConfig):
-    """Rows of the table in list order, padded so that the last chunk may read past the end."""
-    return jnp.pad(table[splat], ((0, config.chunk), (0, 0)))
+def _monomials(config: BlendConfig, dtype):
+    """1, x, y, xx, xy, yy [6 pixels] of the pixel centres about the centre of a tile."""
+    along = np.arange(config.tile) + 0.5 - config.tile / 2
+    x, y = np.tile(along, config.tile), np.repeat(along, config.tile)
+    return jnp.asarray(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]), dtype)
 
 
-def _open(state, end, config: BlendConfig):
-    return (state[0] < end) & (jnp.max(state[1]) > config.transmittance_min)
+def _blend_chunk(alpha, through, config: BlendConfig):
+    """Transmittance before each splat of a chunk and behind all of them, and the weights alpha·T."""
+    behind, before = lax.scan(lambda t, a: (t * (1 - a), t), through, alpha)
+    weight = alpha * before
+    return before, jnp.where(before - weight > config.transmittance_min, weight, 0.0), behind
 
 
-def _forward(table, lists: TileLists, tau, config: BlendConfig):
-    """Planes [tiles, 1 + channels (+ 1), pixels]: transmittance, features, surface depth."""
-    rows_in_order = _chunks(table, lists.splat, config)
-    offsets, pixels, dtype = jnp.arange(config.chunk), config.tile**2, table.dtype
-    width = table.shape[1]
-    channels = width - _SHAPE_COLUMNS
+def _crossing(before, alpha, tau, config: BlendConfig):
+    # the splat that closes a pixel is not blended, yet it may be the surface
+    open_ = before > config.transmittance_min
+    return open_ & (before >= tau) & (before * (1 - alpha) < tau)
 
-    def blend_tile(tile):
-        x, y = _pixels(tile, config, dtype)
-        end = lists.start[tile + 1]
 
-        def blend_chunk(state):
-            position, transmittance, total = state
-            rows = lax.dynamic_slice_in_dim(rows_in_order, position, config.chunk)
-            alpha, _ = _alphas(rows, x, y, position + offsets < end, config)
+def _passes(table, boxes: Boxes, config: BlendConfig, state, visit):
+    """Run `visit(lists, state)` for one pass after the other; the first plane of the state is the transmittance.
 
-            def one(before, alpha):
-                weight, after, _ = _attenuate(before, alpha, config)
-                return after, (weight, _crosses(before, alpha, tau)) if config.surface else weight
+    Returns the last state and the box/tile pairs that a given capacity left out.
+    """
+    shapes = lax.stop_gradient(table[:, :SHAPE_COLUMNS])
+    count = shapes.shape[0]
 
-            transmittance, weight = lax.scan(one, transmittance, alpha)
-            features = rows[:, _SHAPE_COLUMNS:].T
-            if config.surface:
-                weight, crossing = weight
-                total += jnp.concatenate([features[:-1] @ weight, features[-1:] @ crossing.astype(dtype)])
-            else:
-                total += features @ weight
-            return position + config.chunk, transmittance, total
+    def open_tiles(state):
+        return jnp.max(lax.stop_gradient(state[0]), 1) > config.transmittance_min
 
-        state = lists.start[tile], jnp.ones(pixels, dtype), jnp.zeros((channels, pixels), dtype)
-        _, transmittance, total = lax.while_loop(lambda s: _open(s, end, config), blend_chunk, state)
-        return jnp.concatenate([jnp.abs(transmittance)[None], total])
+    def unfinished(carry):
+        first, _, latest, state = carry
+        return (first < count) & (latest > 0) & jnp.any(open_tiles(state))
 
-    return lax.map(blend_tile, jnp.arange(config.tiles, dtype=jnp.int32))
+    def one(carry):
+        first, listed, _, state = carry
+        budget = None if config.capacity is None else config.capacity - listed
+        lists = list_pass(shapes, boxes, first, open_tiles(state), config, config.slots, budget)
+        return lists.next, listed + lists.listed, lists.listed, visit(lists, state)
+
+    zero = jnp.zeros((), jnp.int32)
+    first, _, _, state = lax.while_loop(unfinished, one, (zero, zero, zero + 1, state))
+    if config.capacity is None:
+        return state, zero
+    left = jnp.where(jnp.arange(count) >= first, pairs_in_open_tiles(boxes, open_tiles(state), config), 0)
+    return state, count_pairs(left)
+
+
+def _walk(rows, lists, tiles, state, visit, config: BlendConfig):
+    """Chunk after chunk of the lists of a group of tiles [b], until all are through or opaque.
+
+    `visit(chunk, slot, valid, state)` gets the next rows of each tile, and the slot that each came from; the state
+    starts with the transmittance.
+    """
+    bounds = jnp.append(lists.start, lists.start[-1])
+    end, offsets = bounds[tiles + 1], jnp.arange(config.chunk)
+
+    def unfinished(carry):
+        position, state = carry
+        return jnp.any((position < end) & (jnp.max(state[0], 1) > config.transmittance_min))
+
+    def one(carry):
+        position, state = carry
+        chunk = jax.vmap(lambda first: lax.dynamic_slice_in_dim(rows, first, config.chunk))(position)
+        slot = position[:, None] + offsets
+        return position + config.chunk, visit(chunk, slot, slot < end[:, None], state)
+
+    return lax.while_loop(unfinished, one, (bounds[tiles], state))[1]
+
+
+def _in_list_order(table, lists, config: BlendConfig):
+    """Rows as the lists have them, padded so that the last chunk may read past the end."""
+    owned = (lists.tile < config.tiles)[:, None]
+    # a slot that no tile owns may hold a splat that is not finite
+    rows = as_tiles_see(jnp.where(owned, table[lists.rank], 0.0), lists.tile, config)
+    return jnp.pad(rows, ((0, config.chunk), (0, 0)))
+
+
+def _groups(config: BlendConfig):
+    """Tiles [g b] that are walked together; the last group is filled up with a tile beyond the last, without a list."""
+    together = min(config.tiles_at_once, config.tiles)
+    tiles = jnp.arange(-(-config.tiles // together) * together, dtype=jnp.int32)
+    return jnp.minimum(tiles, config.tiles).reshape(-1, together)
+
+
+def _grouped(planes, groups):
+    """Planes [tiles ...] as [g b ...]."""
+    short = groups.size - planes.shape[0]
+    padded = jnp.pad(planes, [(0, short)] + [(0, 0)] * (planes.ndim - 1)) if short else planes
+    return padded.reshape(*groups.shape, *planes.shape[1:])
+
+
+def _ungrouped(planes, config: BlendConfig):
+    return planes.reshape(-1, *planes.shape[2:])[: config.tiles]
+
+
+def _forward(table, boxes: Boxes, tau, config: BlendConfig):
+    """Planes [tiles, features + alpha (+ surface), pixels], and what the capacity left out."""
+    pixels, dtype, groups = config.tile**2, table.dtype, _groups(config)
+    channels = table.shape[1] - SHAPE_COLUMNS
+
+    def blend_chunk(rows, valid, through, planes):
+        alpha, _ = tile_alphas(rows, valid, config)
+        before, weight, behind = _blend_chunk(alpha, through, config)
+        values = rows[:, _TERMS:].T
+        if not config.surface:
+            return behind, planes + _product(values, weight)
+        picked = _product(values[-1:], _crossing(before, alpha, tau, config).astype(dtype))
+        return behind, planes + jnp.concatenate([_product(values[:-1], weight), picked])
+
+    def visit(lists, state):
+        rows = _in_list_order(table, lists, config)
+
+        def blend_group(group):
+            tiles, *state = group
+
+            def visit_chunk(chunk, _, valid, state):
+                return jax.vmap(blend_chunk)(chunk, valid, *state)
+
+            return _walk(rows, lists, tiles, tuple(state), visit_chunk, config)
+
+        moved = lax.map(blend_group, (groups, *(_grouped(planes, groups) for planes in state)))
+        return tuple(_ungrouped(planes, config) for planes in moved)
+
+    start = jnp.ones((config.tiles, pixels), dtype), jnp.zeros((config.tiles, channels, pixels), dtype)
+    (_, planes), overflow = _passes(table, boxes, config, start, visit)
+    return planes, overflow
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
-def _composite(table, lists: TileLists, tau, config: BlendConfig):
-    return _forward(table, lists, tau, config)
+def _composite(table, boxes: Boxes, tau, config: BlendConfig):
+    return _forward(table, boxes, tau, config)
 
 
-def _composite_fwd(table, lists: TileLists, tau, config: BlendConfig):
-    planes = _forward(table, lists, tau, config)
-    return planes, (table, lists, tau, planes)
+def _composite_fwd(table, boxes: Boxes, tau, config: BlendConfig):
+    planes, overflow = _forward(table, boxes, tau, config)
+    return (planes, overflow), (table, boxes, tau, planes)
 
 
-def _composite_bwd(config: BlendConfig, saved, cotangent):
-    table, lists, tau, planes = saved
-    rows_in_order = _chunks(table, lists.splat, config)
-    offsets, pixels, dtype = jnp.arange(config.chunk), config.tile**2, table.dtype
-    capacity, width = lists.splat.shape[0], table.shape[1]
-    blended = width - _SHAPE_COLUMNS - config.surface  # the surface plane is picked, not blended
-    totals = jnp.sum((planes * cotangent)[:, : 1 + blended], axis=1)
-    local = jnp.arange(pixels, dtype=jnp.int32)
-    u, v = (local % config.tile).astype(dtype) + 0.5, (local // config.tile).astype(dtype) + 0.5
-    # gradients of the conic's quadratic form are moments of the pixel grid, so one product serves all six
-    monomials = jnp.stack([jnp.ones(pixels, dtype), u, v, u * u, u * v, v * v], 1)
+def _composite_bwd(config: BlendConfig, saved, cotangents):
+    table, boxes, tau, planes = saved
+    cotangent = cotangents[0]
+    pixels, dtype, groups = config.tile**2, table.dtype, _groups(config)
+    blended = table.shape[1] - SHAPE_COLUMNS - config.surface  # the surface is picked, not blended
+    totals = jnp.sum((planes * cotangent)[:, :blended], axis=1)
+    monomials = _monomials(config, dtype)
 
-    def walk_tile(tile, gradients):
-        x, y = _pixels(tile, config, dtype)
-        end, total, towards = lists.start[tile + 1], totals[tile], cotangent[tile, 1:]
+    def walk_chunk(rows, valid, through, prefix, total, towards):
+        alpha, unclamped = tile_alphas(rows, valid, config)
+        gain = _product(rows[:, _TERMS : _TERMS + blended], towards[:blended])
 
-        def walk_chunk(state):
-            position, transmittance, prefix, gradients = state
-            rows = lax.dynamic_slice_in_dim(rows_in_order, position, config.chunk)
-            alpha, free = _alphas(rows, x, y, position + offsets < end, config)
-            gain = rows[:, _SHAPE_COLUMNS : _SHAPE_COLUMNS + blended] @ towards[:blended]
+        def one(carry, splat):
+            before, prefix = carry
+            alpha, gain = splat
+            weight = alpha * before
+            weight = jnp.where(before - weight > config.transmittance_min, weight, 0.0)
+            prefix = prefix + weight * gain
+            return (before * (1 - alpha), prefix), (before, weight, prefix)
 
-            def one(carry, splat):
-                before, prefix = carry
-                alpha, gain = splat
-                weight, after, stop = _attenuate(before, alpha, config)
-                prefix = prefix + weight * gain
-                slope = jnp.where(stop | (alpha == 0), 0.0, before * gain - (total - prefix) / (1 - alpha))
-                picked = (_crosses(before, alpha, tau),) if config.surface else ()
-                return (after, prefix), (weight, slope, *picked)
+        (behind, end), (before, weight, prefix) = lax.scan(one, (through, prefix), (alpha, gain))
+        slope = weight * gain - (total - prefix) * (alpha / (1 - alpha))
+        slope = jnp.where((weight > 0) & (unclamped < config.alpha_max), slope, 0.0)
+        # the exponent is linear in its coefficients, so their gradients are moments of the pixel grid
+        columns = [_product(slope, monomials.T), _product(weight, towards[:blended].T)]
+        if config.surface:
+            columns.append(_product(_crossing(before, alpha, tau, config).astype(dtype), towards[blended:].T))
+        return behind, end, jnp.concatenate(columns, 1)
 
-            (transmittance, prefix), (weight, slope, *picked) = lax.scan(one, (transmittance, prefix), (alpha, gain))
-            towards_power = jnp.where(free, -slope * alpha, 0.0)
-            columns = [towards_power @ monomials, weight @ towards[:blended].T]
-            columns += [p.astype(dtype) @ towards[blended:].T for p in picked]
-            gradients = lax.dynamic_update_slice_in_dim(gradients, jnp.concatenate(columns, 1), position, 0)
-            return position + config.chunk, transmittance, prefix, gradients
+    def visit(lists, state):
+        *state, gradient = state
+        rows, pull_back = jax.vjp(lambda table: _in_list_order(table, lists, config), table)
 
-        state = lists.start[tile], jnp.ones(pixels, dtype), jnp.zeros(pixels, dtype), gradients
-        return lax.while_loop(lambda s: _open(s, end, config), walk_chunk, state)[3]
+        def walk_group(of_rows, group):
+            tiles, total, towards, *state = group
 
-    # a chunk may spill zeros past its tile's end; the next tile, walked later, overwrites them
-    entries = lax.fori_loop(0, config.tiles, walk_tile, jnp.zeros((capacity + config.chunk, width), dtype))[:capacity]
-    dx = (lists.tile % config.columns * config.tile).astype(dtype) - rows_in_order[:capacity, 0]
-    dy = (lists.tile // config.columns * config.tile).astype(dtype) - rows_in_order[:capacity, 1]
-    m, mx, my, mxx, mxy, myy = entries[:, :_SHAPE_COLUMNS].T
-    moments = jnp.stack(
-        [
-            mx + dx * m,
-            my + dy * m,
-            mxx + 2 * dx * mx + dx * dx * m,
-            mxy + dx * my + dy * mx + dx * dy * m,
-            myy + 2 * dy * my + dy * dy * m,
-            m,
-        ],
-        1,
-    )
-    per_entry = jnp.concatenate([moments, entries[:, _SHAPE_COLUMNS:]], 1)
-    per_entry = jnp.where((lists.tile < config.tiles)[:, None], per_entry, 0.0)
-    sums = jnp.zeros_like(table).at[lists.splat].add(per_entry)
+            def visit_chunk(chunk, slot, valid, state):
+                through, prefix, of_rows = state
+                *state, change = jax.vmap(walk_chunk)(chunk, valid, through, prefix, total, towards)
+                return *state, of_rows.at[slot.ravel()].add(change.reshape(-1, change.shape[-1]))
 
-    a, b, c, opacity = (table[:, k] for k in range(2, _SHAPE_COLUMNS))
-    sx, sy, sxx, sxy, syy, s = sums[:, :_SHAPE_COLUMNS].T
-    shape = [-(a * sx + b * sy), -(b * sx + c * sy), 0.5 * sxx, sxy, 0.5 * syy]
-    shape.append(jnp.where(opacity > 0, -s / jnp.where(opacity > 0, opacity, 1.0), 0.0))
-    gradient = jnp.concatenate([jnp.stack(shape, 1), sums[:, _SHAPE_COLUMNS:]], 1)
-    no_gradient = jax.tree.map(lambda index: np.zeros(index.shape, jax.dtypes.float0), lists)
+            *state, of_rows = _walk(rows, lists, tiles, (*state, of_rows), visit_chunk, config)
+            return of_rows, tuple(state)
+
+        per_tile = (totals, cotangent, *state)
+        of_rows, moved = lax.scan(
+            walk_group, jnp.zeros_like(rows), (groups, *(_grouped(planes, groups) for planes in per_tile))
+        )
+        return *(_ungrouped(planes, config) for planes in moved), gradient + pull_back(of_rows)[0]
+
+    planes_of = (jnp.ones((config.tiles, pixels), dtype), jnp.zeros((config.tiles, pixels), dtype))
+    (*_, gradient), _ = _passes(table, boxes, config, (*planes_of, jnp.zeros_like(table)), visit)
+    no_gradient = jax.tree.map(lambda index: np.zeros(index.shape, jax.dtypes.float0), boxes)
     return gradient, no_gradient, jnp.zeros_like(tau)
 
 

@@ -8,6 +8,7 @@ import jax  # noqa: E402  (the hook must be installed before pigjax is imported)
 import pytest  # noqa: E402
 
 jax.config.update("jax_numpy_rank_promotion", "allow")
+jax.config.update("jax_num_cpu_devices", 2)  # for what several devices share
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ PACKAGE = Path(__file__).parents[1] / "pigjax"
 # every module may import what stands on a lower floor only
 FLOORS = [
     {"errors", "arrays"},
-    {"linalg", "metrics"},
-    {"camera", "materials"},
+    {"linalg", "metrics", "lists"},
+    {"camera", "materials", "bands"},
     {"tiles", "colliders", "transfers"},
     {"splat", "matter"},
     {"tile_walks", "clamp", "shells", "relocation", "overlay", "mls_mpm", "io"},
@@ -24,7 +24,8 @@ FLOORS = [
 ]
 FLOOR_OF = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
 # the two worlds meet in particles.py and solids.py only
-SPLATS = {"splat", "tiles", "tile_walks", "clamp", "segmentation", "relocation", "reconstruct", "filling", "shells"}
+SPLATS = {"splat", "lists", "bands", "tiles", "tile_walks", "clamp", "segmentation", "relocation", "reconstruct"}
+SPLATS |= {"filling", "shells"}
 MATTER = {"matter", "mls_mpm", "transfers", "materials", "colliders"}
 
 

@@ -12,10 +12,11 @@ from dense import dense_render
 import pigjax.splat as splat_module
 from pigjax.camera import Camera, look_at
 from pigjax.errors import InputError
+from pigjax.lists import Boxes, count_pairs, front_to_back, list_pass, pairs_in_open_tiles
 from pigjax.splat import OUTPUTS, Gaussians, RenderConfig, project_splats, render, required_capacity, surface_depth
-from pigjax.tiles import tile_lists
 
-EXACT = RenderConfig(alpha_min=1e-7, transmittance_min=0.0, capacity=60_000)
+EXACT = RenderConfig(alpha_min=1e-7, transmittance_min=0.0)
+DEFAULT = RenderConfig()
 
 
 def make_scene(count=60, seed=0, width=40, height=28, degree=3, spread=1.0):
@@ -166,7 +167,7 @@ def smooth_loss():
         scene, camera = make_scene(count=25, width=24, height=20)
         weights = jnp.asarray(np.random.default_rng(2).normal(size=(20, 24, 9)))
         # thresholds make jumps that a difference quotient sees and a derivative does not: switch them off
-        config = RenderConfig(alpha_min=1e-9, alpha_max=1.0, transmittance_min=0.0, capacity=2_000)
+        config = RenderConfig(alpha_min=1e-9, alpha_max=1.0, transmittance_min=0.0)
         loss = jax.jit(lambda inputs: scalar_loss(*inputs, config, weights))
         inputs = gaussians_of(scene), camera
         return loss, inputs, jax.jit(jax.grad(loss))(inputs)
@@ -204,7 +205,7 @@ def test_forward_mode_and_hessian_agree_with_reverse_mode(x64):
     gaussians = gaussians_of(scene)
 
     def loss(means, differentiation):
-        config = RenderConfig(differentiation=differentiation, capacity=64)
+        config = RenderConfig(differentiation=differentiation)
         moved = Gaussians(means, gaussians.log_scales, gaussians.quats, gaussians.logit_opacities, gaussians.sh)
         return jnp.sum(render(moved, camera, config).rgb ** 2)
 
@@ -273,33 +274,153 @@ def test_empty_scene_is_background_and_one_pixel_image_works():
     assert np.abs(render(gaussians, camera).rgb - rgb).max() < 1e-5
 
 
-def test_overflow_is_counted_drops_the_farthest_and_required_capacity_is_enough():
+def test_a_given_capacity_is_counted_and_drops_the_farthest_and_none_drops_nothing():
     scene, camera = make_scene(count=200)
     gaussians = gaussians_of(scene)
     need = required_capacity(gaussians, camera)
     full = render(gaussians, camera, RenderConfig(capacity=need))
     short = render(gaussians, camera, RenderConfig(capacity=need - 50))
     assert full.overflow == 0
-    assert short.overflow == 50
-    projected = project_splats(splat_module.as_splats(gaussians), camera, RenderConfig())
-    blending = splat_module.blend_config(camera, RenderConfig(), surface=False)
-
-    def pairs(capacity):
-        lists = tile_lists(projected, blending, capacity)
-        used = np.asarray(lists.tile) < blending.tiles
-        return set(zip(np.asarray(lists.tile)[used].tolist(), np.asarray(lists.splat)[used].tolist()))
-
-    depths, kept = np.asarray(projected.depths), pairs(need - 50)
-    lost = pairs(need) - kept
-    assert lost
-    assert min(depths[s] for _, s in lost) >= max(depths[s] for _, s in kept)
+    # splats are taken whole, so a little more than the missing pairs may be left out
+    assert 50 <= short.overflow < 50 + 6
+    np.testing.assert_array_equal(full.rgb, render(gaussians, camera).rgb)
+    order = np.argsort(np.linalg.norm(scene["means"] - np.asarray(camera.position), axis=1))
+    nearest = jax.tree.map(lambda v: v[order[:60]], gaussians)
+    few = required_capacity(nearest, camera)
+    assert np.abs(render(gaussians, camera, RenderConfig(capacity=few)).alpha - full.alpha).max() > 1e-3
 
 
-def test_two_key_sort_draws_the_same_picture(monkeypatch):
+def lists_of(gaussians, camera, config=DEFAULT):
+    projected = project_splats(splat_module.as_splats(gaussians), camera, config)
+    blending = splat_module.blend_config(camera, config, len(gaussians), surface=False)
+    boxes = front_to_back(projected, blending)
+    return projected, blending, boxes, projected.shapes[boxes.order]
+
+
+@pytest.mark.parametrize("slots", [12, 40, None])
+def test_pictures_and_gradients_do_not_depend_on_the_size_of_a_pass(slots):
+    scene, camera = make_scene(count=150)
+    gaussians = gaussians_of(scene)
+
+    def loss(gaussians, config):
+        frame = render(gaussians, camera, config, outputs=("rgb", "surface_depth"))
+        return jnp.sum(frame.rgb**2) + jnp.sum(jnp.nan_to_num(frame.surface_depth)), frame
+
+    (_, frame), gradient = jax.value_and_grad(loss, has_aux=True)(gaussians, RenderConfig(slots=slots))
+    (_, truth), expected = jax.value_and_grad(loss, has_aux=True)(gaussians, RenderConfig(slots=10_000))
+    # weights are summed in another grouping
+    np.testing.assert_allclose(frame.rgb, truth.rgb, atol=1e-6)
+    np.testing.assert_array_equal(frame.surface_depth, truth.surface_depth)
+    for ours, other in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected)):
+        np.testing.assert_allclose(ours, other, atol=2e-5 * np.abs(other).max())
+
+
+@pytest.mark.parametrize("near", [0.0, 0.01])
+@pytest.mark.parametrize("count", [1, 2, 500])
+def test_depth_order_is_the_stable_argsort(count, near):
+    rng = np.random.default_rng(count)
+    depths = rng.choice(np.exp(rng.uniform(np.log(0.02), np.log(1e6), max(count // 2, 1))), count).astype(np.float32)
+    scene, camera = make_scene(count=count)
+    projected, blending, *_ = lists_of(gaussians_of(scene), camera, RenderConfig(near=near))
+    visible = rng.random(count) < 0.8
+    projected = eqx.tree_at(lambda p: (p.depths, p.visible), projected, (jnp.asarray(depths), jnp.asarray(visible)))
+    truth = np.argsort(np.where(visible, depths, np.inf), kind="stable")
+    np.testing.assert_array_equal(front_to_back(projected, blending).order, truth)
+
+
+def test_a_pass_lists_the_splats_that_reach_each_open_tile_front_to_back_and_no_others():
+    scene, camera = make_scene(count=80)
+    projected, blending, boxes, shapes = lists_of(gaussians_of(scene), camera)
+    opened = np.random.default_rng(0).random(blending.tiles) < 0.6
+    lists = list_pass(shapes, boxes, 3, jnp.asarray(opened), blending, 400)
+    assert lists.next == 80
+    listed = np.zeros((80, blending.tiles), bool)
+    for tile in range(blending.tiles):
+        ranks = np.asarray(lists.rank)[lists.start[tile] : lists.start[tile + 1]]
+        assert (np.diff(ranks) > 0).all()
+        listed[ranks, tile] = True
+
+    def reach(steps):
+        """Largest exponent within the rectangle of a tile's pixel centres, sampled."""
+        x, y = (np.arange(n)[:, None] * 16 + np.linspace(0.5, 15.5, steps) for n in (blending.columns, blending.rows))
+        u, v, a, b, c, peak = np.asarray(shapes, np.float64).T[..., None, None]
+        dx, dy = x.ravel() - u, y.ravel()[:, None] - v
+        exponent = peak - 0.5 * (a * dx**2 + c * dy**2) - b * dx * dy
+        return exponent.reshape(80, blending.rows, steps, blending.columns, steps).max((2, 4)).reshape(80, -1)
+
+    candidates = np.asarray(projected.visible)[np.asarray(boxes.order), None] & (np.arange(80) >= 3)[:, None] & opened
+    needed = candidates & (reach(16) >= np.log(1 / 255))
+    assert (listed >= needed).all()
+    # a fine sampling misses the largest value by little
+    assert (listed <= candidates & (reach(121) >= np.log(1 / 255) - 0.02)).all()
+
+
+def test_what_is_hidden_behind_opaque_tiles_takes_no_slots():
+    scene, camera = make_scene(count=60)
+    _, blending, boxes, _ = lists_of(gaussians_of(scene), camera)
+    all_pairs = np.asarray(pairs_in_open_tiles(boxes, None, blending))
+    opened = jnp.zeros(blending.tiles, bool).at[0].set(True)
+    first_tile = (np.asarray(boxes.low) == 0).all(1) & (all_pairs > 0)
+    np.testing.assert_array_equal(pairs_in_open_tiles(boxes, opened, blending), np.where(first_tile, all_pairs, 0))
+
+
+def test_sums_of_pairs_that_would_wrap_do_not():
+    """Half a million splats that cover 8,160 tiles each are more pairs than an int32 counts."""
+    size, tiles = 500_000, 8160
+    scene, camera = make_scene(count=1, width=1920, height=1080)
+    _, blending, _, shapes = lists_of(gaussians_of(scene), camera)
+    box = jnp.broadcast_to(jnp.array([blending.columns, blending.rows]), (size, 2))
+    boxes = Boxes(jnp.arange(size), jnp.zeros((size, 2), jnp.int32), box)
+    assert blending.tiles == tiles
+    shapes = jnp.broadcast_to(shapes[0], (size, 6))
+    lists = jax.jit(lambda s, b: list_pass(s, b, 0, None, blending, 4 * tiles))(shapes, boxes)
+    assert lists.next == 4
+    assert lists.listed == 4 * tiles
+    assert count_pairs(boxes.size[:, 0] * boxes.size[:, 1]) == 2**31 - 1
+
+
+def test_two_key_sort_makes_the_same_lists(monkeypatch):
     scene, camera = make_scene(count=50)
-    one_key = render(gaussians_of(scene), camera).rgb
-    monkeypatch.setattr("pigjax.tiles._KEY_LIMIT", 10)
-    np.testing.assert_array_equal(render(gaussians_of(scene), camera).rgb, one_key)
+    _, blending, boxes, shapes = lists_of(gaussians_of(scene), camera)
+    one_key = list_pass(shapes, boxes, 0, None, blending, 300)
+    monkeypatch.setattr("pigjax.lists._KEY_LIMIT", 10)
+    two_keys = list_pass(shapes, boxes, 0, None, blending, 300)
+    used = int(one_key.start[-1])
+    np.testing.assert_array_equal(two_keys.start, one_key.start)
+    np.testing.assert_array_equal(two_keys.rank[:used], one_key.rank[:used])
+
+
+@pytest.mark.parametrize("together", [2, 5, 100])
+def test_tiles_walked_together_draw_the_same(together):
+    scene, camera = make_scene(count=100)
+    gaussians = gaussians_of(scene)
+
+    def loss(gaussians, config):
+        return jnp.sum(render(gaussians, camera, config).rgb ** 2)
+
+    value, gradient = jax.value_and_grad(loss)(gaussians, RenderConfig(tiles_at_once=together, chunk=8))
+    truth, expected = jax.value_and_grad(loss)(gaussians, RenderConfig())
+    np.testing.assert_allclose(value, truth, rtol=1e-6)
+    for ours, other in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected)):
+        np.testing.assert_allclose(ours, other, atol=2e-5 * np.abs(other).max())
+
+
+def test_two_devices_draw_what_one_draws():
+    scene, camera = make_scene(count=101, height=50)
+    gaussians = gaussians_of(scene)
+
+    def loss(gaussians, camera, config):
+        frame = render(gaussians, camera, config, outputs=("rgb", "alpha", "depth"), background=0.5)
+        return jnp.sum(frame.rgb**2) + jnp.sum(frame.depth), frame
+
+    run = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
+    (_, one), expected = run(gaussians, camera, RenderConfig())
+    (_, two), gradient = run(gaussians, camera, RenderConfig(bands=2))
+    np.testing.assert_allclose(two.rgb, one.rgb, atol=1e-6)
+    for ours, other in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected)):
+        np.testing.assert_allclose(ours, other, atol=2e-5 * np.abs(other).max())
+    with pytest.raises(InputError, match=r"bands = 64: JAX has 2 local devices.*jax_num_cpu_devices"):
+        render(gaussians, camera, RenderConfig(bands=64))
 
 
 def test_vmap_over_cameras_and_over_splats_equals_one_by_one():
@@ -319,10 +440,10 @@ def test_only_the_outputs_asked_for_are_traced():
     gaussians = gaussians_of(scene)
     alone = jax.make_jaxpr(lambda g: render(g, camera, outputs=("alpha",)).alpha)(gaussians)
     coloured = jax.make_jaxpr(lambda g: render(g, camera, outputs=("alpha", "rgb")).alpha)(gaussians)
-    # the loop's table has 6 shape columns, and 3 more where colours are drawn
-    assert ",6]" in str(alone)
-    assert ",9]" not in str(alone)
-    assert ",9]" in str(coloured)
+    # the loop's table has 6 shape columns, 1 for alpha, and 3 more where colours are drawn
+    assert "f32[10,7]" in str(alone)
+    assert "f32[10,10]" not in str(alone)
+    assert "f32[10,10]" in str(coloured)
 
 
 def test_colour_turns_with_the_local_rotation():

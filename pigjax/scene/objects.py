@@ -14,7 +14,7 @@ from pigjax.errors import MissingFileError
 from pigjax.overlay import id_colours, id_image, legend_sheet, overlay
 from pigjax.scene.schema import load_scene
 from pigjax.segmentation import fill_unseen, lift_masks
-from pigjax.splat import Gaussians, RenderConfig, render, required_capacity, sh_degree_of
+from pigjax.splat import Gaussians, render, sh_degree_of
 
 _SHEET_VIEWS = 4
 _SH_CONSTANT = 0.28209479177387814
@@ -54,12 +54,11 @@ def _sheet(
 ) -> np.ndarray:
     """A few photos with the lifted objects laid over them, and the legend below."""
     chosen = np.unique(np.linspace(0, len(views) - 1, _SHEET_VIEWS).astype(int))
-    config = RenderConfig(capacity=required_capacity(gaussians, views.cameras[chosen]))
     membership = jax.nn.one_hot(object_id, num_ids)
     tinted, shown = [], []
     for view in chosen:
         camera = views.cameras[int(view)]
-        frame = render(gaussians, camera, config, outputs=("object_weights",), object_weights=membership)
+        frame = render(gaussians, camera, outputs=("object_weights",), object_weights=membership)
         assert frame.object_weights is not None
         shown.append(np.asarray(id_image(frame.object_weights)))
         tinted.append(overlay(views.images[view], shown[-1]))

@@ -25,7 +25,7 @@ from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs
 from pigjax.scene.report import RunReport
 from pigjax.scene.schema import Scene
 from pigjax.segmentation import Labels
-from pigjax.splat import Gaussians, RenderConfig, render, required_capacity
+from pigjax.splat import Gaussians, RenderConfig, render
 
 _MOST_NODES = 200_000_000
 _SHEET_FRAMES = 12
@@ -209,31 +209,27 @@ def _draw(
     focus = np.asarray(plan.particles.x).mean(0)
     cameras = make_cameras(scene, inputs, focus)
     background = jnp.asarray(scene.camera.background)
-    capacity = int(1.5 * required_capacity(gaussians, cameras))
+    config = RenderConfig(bands=jax.local_device_count())
 
     # everything large comes in as an argument: XLA would fold constants for minutes
-    def pose_and_render(capacity: int, gaussians: Gaussians, particles: Particles, binding, camera: Camera):
+    @jax.jit
+    def pose_and_render(gaussians: Gaussians, particles: Particles, binding, camera: Camera):
         splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
-        frame = render(splats, camera, RenderConfig(capacity=capacity), background=background, outputs=("rgb",))
-        return jnp.clip(frame.rgb, 0, 1), frame.overflow
+        frame = render(splats, camera, config, background=background, outputs=("rgb",))
+        return jnp.clip(frame.rgb, 0, 1)
 
-    compiled = jax.jit(pose_and_render, static_argnums=0)
-
-    def draw(frame: int) -> tuple[jax.Array, jax.Array]:
+    def draw(frame: int) -> jax.Array:
         state = io.load_state(out / "states", frame, signature=key)
         particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, (state["x"], state["F_visual"]))
-        return compiled(capacity, gaussians, particles, plan.binding, cameras[frame])
+        return pose_and_render(gaussians, particles, plan.binding, cameras[frame])
 
     sheet_frames = np.unique(np.linspace(0, frames, _SHEET_FRAMES).round().astype(int))
     sheet: list[np.ndarray] = []
 
     def pictures() -> Iterator[np.ndarray]:
-        nonlocal capacity
         for frame in range(frames + 1):
             tell("draw", frame, frames + 1)
-            while (drawn := draw(frame))[1] > 0:
-                capacity = int(1.5 * (capacity + drawn[1]))
-            picture = np.asarray(drawn[0])
+            picture = np.asarray(draw(frame))
             if frame in sheet_frames:
                 sheet.append(picture)
             yield picture
@@ -252,9 +248,8 @@ def _draw_objects(
     """The first frame with its objects tinted, and the legend below."""
     count = int(np.max(labels.object_id)) + 1
     membership = jax.nn.one_hot(labels.object_id, count)
-    config = RenderConfig(capacity=required_capacity(inputs.gaussians, camera))
     frame = render(
-        inputs.gaussians, camera, config, outputs=("object_weights",), object_weights=membership, background=background
+        inputs.gaussians, camera, outputs=("object_weights",), object_weights=membership, background=background
     )
     assert frame.object_weights is not None
     ids = id_image(frame.object_weights)

@@ -1,0 +1,30 @@
+"""What the benchmarks share: warm medians with compile time apart, and the machine's name."""
+
+import platform
+import statistics
+import time
+from pathlib import Path
+
+import jax
+
+
+def measure(function, *inputs, repeats=9, seconds=20.0):
+    """Compile seconds, median seconds of warm calls, and the result."""
+    start = time.perf_counter()
+    compiled = jax.jit(function).lower(*inputs).compile()
+    compile_seconds = time.perf_counter() - start
+    result = jax.block_until_ready(compiled(*inputs))
+    times, begun = [], time.perf_counter()
+    while len(times) < repeats and (len(times) < 3 or time.perf_counter() - begun < seconds):
+        start = time.perf_counter()
+        jax.block_until_ready(compiled(*inputs))
+        times.append(time.perf_counter() - start)
+    return compile_seconds, statistics.median(times), result
+
+
+def machine() -> str:
+    """Processor, cores and JAX in one line."""
+    info = Path("/proc/cpuinfo")
+    names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
+    name = f"{names[0]}, {len(names)} cores" if names else platform.processor()
+    return f"{name}; jax {jax.__version__} on {jax.local_device_count()} {jax.default_backend()} device(s)"
