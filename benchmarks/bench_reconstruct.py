@@ -1,10 +1,11 @@
 """Held-out PSNR against time on the bundled tabletop: `python benchmarks/bench_reconstruct.py [--steps N]`."""
 
 import argparse
+import os
 import resource
 from pathlib import Path
 
-from pigjax import FitConfig, load_points, load_views, reconstruct, save_ply
+import jax
 
 TABLETOP = Path(__file__).parents[1] / "examples" / "tabletop"
 
@@ -12,11 +13,27 @@ parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--steps", type=int, default=1500)
 parser.add_argument("--splats", type=int, default=15_000)
 parser.add_argument("--every", type=int, default=500, help="steps between evaluations")
+parser.add_argument("--sh-degree", type=int, default=1)
+parser.add_argument("--devices", type=int, default=len(os.sched_getaffinity(0)), help="host devices on a CPU")
 parser.add_argument("--out", type=Path, help="write the Gaussians here (.ply)")
 arguments = parser.parse_args()
+if jax.config.jax_platforms in (None, "", "cpu"):
+    jax.config.update("jax_num_cpu_devices", arguments.devices)
 
+from _timing import machine  # noqa: E402
+
+from pigjax import FitConfig, RenderConfig, load_points, load_views, reconstruct, save_ply  # noqa: E402
+
+print(machine())
 views = load_views(TABLETOP)
-config = FitConfig(steps=arguments.steps, splats=arguments.splats, background=1.0, evaluate_every=arguments.every)
+config = FitConfig(
+    steps=arguments.steps,
+    splats=arguments.splats,
+    sh_degree=arguments.sh_degree,
+    background=1.0,
+    evaluate_every=arguments.every,
+    render=RenderConfig(bands=arguments.devices),
+)
 
 
 def tell(progress):

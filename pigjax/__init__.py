@@ -9,12 +9,13 @@ from pigjax.camera import Camera, interpolate_path, look_at, orbit, stack_camera
 from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.colliders import Box, Plane, SampledDistance, Sphere
 from pigjax.errors import InputError, MissingFileError, SceneError, SimulationError
-from pigjax.io import Views, load_masks, load_ply, load_points, load_views, save_ply, write_video
+from pigjax.io import Views, load_gaussians, load_masks, load_ply, load_points, load_views, save_ply, write_video
 from pigjax.materials import Material, MaterialTable, material_table, preset
 from pigjax.matter import Grid, Health, Particles, Trajectory, fit_grid, make_particles
 from pigjax.metrics import boundary_iou, mean_iou, psnr, ssim
 from pigjax.mls_mpm import SimConfig, choose_substeps, rollout, stable_dt, step
 from pigjax.particles import at_frame, bind, deform, seed_particles
+from pigjax.pruning import contributions, prune
 from pigjax.reconstruct import FitConfig, reconstruct
 from pigjax.scene import RunReport, Scene, load_scene, run_scene
 from pigjax.segmentation import Labels, fill_unseen, lift_masks, object_mask
@@ -56,12 +57,14 @@ __all__ = [
     "boundary_iou",
     "choose_substeps",
     "collider_from_gaussians",
+    "contributions",
     "deform",
     "eigen_clamp",
     "fill_unseen",
     "fit_grid",
     "interpolate_path",
     "lift_masks",
+    "load_gaussians",
     "load_masks",
     "load_ply",
     "load_points",
@@ -74,6 +77,7 @@ __all__ = [
     "object_mask",
     "orbit",
     "preset",
+    "prune",
     "psnr",
     "reconstruct",
     "render",

@@ -144,7 +144,7 @@ def reconstruct(
 
 @app.command()
 def segment(
-    gaussians: Annotated[Path, typer.Argument(help="Trained .ply.")],
+    gaussians: Annotated[Path, typer.Argument(help="Trained .ply, .splat or .spz.")],
     views: Annotated[Path, typer.Argument(help="Posed photos with a folder object_mask beside them.")],
     out: Out = Path("segments"),
     masks: Annotated[Path | None, typer.Option(help="Folder of masks, if it lies elsewhere.")] = None,
@@ -157,7 +157,7 @@ def segment(
     from pigjax import io
     from pigjax.scene.objects import segment_files
 
-    cloud = io.load_ply(gaussians)
+    cloud = io.load_gaussians(gaussians)
     loaded = io.load_views(views, masks=masks if masks is not None else True)
     known = {} if names is None else {int(k): str(v) for k, v in io.read_json(names).items()}
     counts = segment_files(cloud, loaded, known, out, tau_T=tau_t, tau_d=tau_d, fill=fill)

@@ -27,10 +27,10 @@ def relocate(gaussians: Gaussians, key: PRNGKeyArray) -> tuple[Gaussians, Float[
     """
     opacities = jax.nn.sigmoid(gaussians.logit_opacities)
     dead = opacities < DEAD_OPACITY
-    logits = jnp.where(dead, -jnp.inf, jnp.log(jnp.maximum(opacities, DEAD_OPACITY)))
     # with nothing alive there is nowhere to go
     dead &= ~jnp.all(dead)
-    target = jax.random.categorical(key, logits, shape=opacities.shape)
+    # `categorical` would draw a number for every pair of splats
+    target = jax.random.choice(key, opacities.shape[0], opacities.shape, p=jnp.where(dead, 0.0, opacities))
     source = jnp.where(dead, target, jnp.arange(opacities.shape[0]))
     copies = jnp.minimum(jnp.zeros_like(source).at[source].add(1), _MOST_COPIES)[source]
     opacity, shrink = split_opacity(opacities[source], copies)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
@@ -14,7 +16,7 @@ from pigjax.arrays import array_field, static_field
 from pigjax.bands import collect, spread
 from pigjax.camera import Camera, stack_cameras, to_camera
 from pigjax.errors import InputError
-from pigjax.linalg import quat_to_matrix, safe_normalize
+from pigjax.linalg import quat_to_matrix, safe_normalize, svd
 from pigjax.lists import BlendConfig, Projected, count_pairs, slots_of, tile_boxes
 from pigjax.tiles import blend
 
@@ -55,6 +57,8 @@ class Frame(eqx.Module):
     depth: Float[Array, "*b h w"] | None = None  # mean camera z of what is seen [m], 0 where nothing is
     surface_depth: Float[Array, "*b h w"] | None = None  # camera z [m], NaN where transmittance stays above tau_T
     object_weights: Float[Array, "*b h w m"] | None = None  # share of each object in the pixel
+    normals: Float[Array, "*b h w 3"] | None = None  # unit, in the world, towards the camera; 0 where nothing is
+    features: Float[Array, "*b h w f"] | None = None  # sums of each splat's features weighted by alpha·T
     overflow: Int[Array, "*b"] | None = None  # box/tile pairs dropped for want of capacity
 
 
@@ -71,13 +75,13 @@ class RenderConfig(eqx.Module):
     dilation: float = static_field(default=0.3)  # added to the 2D covariance [px²]
     antialias: bool = static_field(default=False)  # lower the opacity by what the dilation added
     near: float = static_field(default=0.01)  # [m]
-    chunk: int = static_field(default=64)  # splats blended between two looks at whether the tile is opaque
+    chunk: int | None = static_field(default=None)  # splats blended between two looks at a tile; None: 64, or 16 if few
     tiles_at_once: int | None = static_field(default=None)  # walked together; None: 1 on a CPU, 2048 elsewhere
     bands: int = static_field(default=1)  # local devices that share the image, each a band of rows
     differentiation: str = static_field(default="reverse")  # "forward" for jvp and hessians
 
 
-OUTPUTS = ("rgb", "alpha", "depth", "surface_depth", "object_weights")
+OUTPUTS = ("rgb", "alpha", "depth", "surface_depth", "object_weights", "normals", "features")
 _SH_CONSTANT = 0.28209479177387814
 _FOV_MARGIN = 0.3  # the projection's linearisation is held at this share of half the image beyond its edge
 
@@ -103,6 +107,7 @@ def render(
     background: Float[Array, "*c"] | float = 0.0,
     outputs: Sequence[str] = ("rgb", "alpha"),
     object_weights: Float[Array, "n m"] | None = None,
+    features: Float[Array, "n f"] | None = None,
     tau_T: Float[Array, ""] | float = 0.5,
 ) -> Frame:
     """Draw splats through one camera (Kerbl et al. 2023); `vmap` over cameras for a batch.
@@ -112,55 +117,60 @@ def render(
         camera: a single camera.
         config: thresholds and capacities.
         background: colour behind the splats, one number, three, or an image.
-        outputs: any of "rgb", "alpha", "depth", "surface_depth", "object_weights"; only these are traced.
+        outputs: any of "rgb", "alpha", "depth", "surface_depth", "object_weights", "normals", "features"; only these
+            are traced. A normal is the shortest axis of a splat.
         object_weights: membership of each splat in each object, needed for the output of that name.
+        features: any channels of each splat, needed for the output of that name.
         tau_T: transmittance that marks the surface (paper 3.2); not differentiated through.
 
     Raises:
-        InputError: unknown output, or object weights asked for but not given.
+        InputError: unknown output, or object weights or features asked for but not given.
     """
     unknown = [name for name in outputs if name not in OUTPUTS]
     if unknown or not outputs:
         raise InputError(f"outputs = {tuple(outputs)}: choose from {', '.join(OUTPUTS)}.")
     if "object_weights" in outputs and object_weights is None:
         raise InputError("outputs has 'object_weights': pass object_weights, the membership [n m] of each splat.")
+    if "features" in outputs and features is None:
+        raise InputError("outputs has 'features': pass features, the channels [n f] of each splat.")
+    given = {"object_weights": object_weights, "features": features}
+    given = {name: values for name, values in given.items() if name in outputs}
     tau_T, background = jnp.asarray(tau_T), jnp.asarray(background)
-    return _render(gaussians_or_splats, camera, config, background, tuple(outputs), object_weights, tau_T)
+    return _render(gaussians_or_splats, camera, config, background, tuple(outputs), given, tau_T)
 
 
 @eqx.filter_jit
-def _render(gaussians_or_splats, camera, config, background, outputs, object_weights, tau_T) -> Frame:
+def _render(gaussians_or_splats, camera, config, background, outputs, given, tau_T) -> Frame:
     splats = as_splats(spread(gaussians_or_splats, config.bands))
     if len(splats) == 0:
         # gathers need a row: one splat of opacity 0 draws nothing
-        splats, object_weights = jax.tree.map(lambda v: jnp.zeros((1, *v.shape[1:]), v.dtype), (splats, object_weights))
-    features = []
-    if "rgb" in outputs:
-        features.append(colours(splats, camera, config.sh_degree))
+        splats, given = jax.tree.map(lambda v: jnp.zeros((1, *v.shape[1:]), v.dtype), (splats, given))
     blending = blend_config(camera, config, len(splats), surface="surface_depth" in outputs)
     projected = project_splats(splats, camera, config)
+    channels = {}
+    if "rgb" in outputs:
+        channels["rgb"] = colours(splats, camera, config.sh_degree)
     if "depth" in outputs:
-        features.append(projected.depths[:, None])
-    if "object_weights" in outputs:
-        features.append(object_weights)
-    dtype = projected.depths.dtype
-    table = jnp.concatenate(features, 1) if features else jnp.zeros((len(splats), 0), dtype)
-    projected, table = collect((projected, table), config.bands)
+        channels["depth"] = projected.depths[:, None]
+    if "normals" in outputs:
+        channels["normals"] = normals(splats, camera)
+    channels |= given
+    none = jnp.zeros((len(splats), 0), projected.depths.dtype)
+    projected, table = collect((projected, jnp.concatenate([none, *channels.values()], 1)), config.bands)
     reverse = config.differentiation == "reverse"
     alpha, image, surface, overflow = blend(projected, table, blending, tau_T, reverse=reverse)
 
-    frame = {"overflow": overflow, "alpha": alpha if "alpha" in outputs else None}
+    ends = np.cumsum([values.shape[1] for values in channels.values()])
+    planes: dict[str, Any] = dict(zip(channels, jnp.split(image, ends[:-1], axis=-1)))
     if "rgb" in outputs:
-        frame["rgb"] = image[..., :3] + (1 - alpha)[..., None] * background
-        image = image[..., 3:]
+        planes["rgb"] += (1 - alpha)[..., None] * background
     if "depth" in outputs:
-        frame["depth"] = jnp.where(alpha > 0, image[..., 0] / jnp.where(alpha > 0, alpha, 1.0), 0.0)
-        image = image[..., 1:]
-    if "object_weights" in outputs:
-        frame["object_weights"] = image
+        planes["depth"] = jnp.where(alpha > 0, planes["depth"][..., 0] / jnp.where(alpha > 0, alpha, 1.0), 0.0)
+    if "normals" in outputs:
+        planes["normals"] = safe_normalize(planes["normals"])
     if surface is not None:
-        frame["surface_depth"] = jnp.where(surface > 0, surface, jnp.nan)
-    return Frame(**frame)
+        planes["surface_depth"] = jnp.where(surface > 0, surface, jnp.nan)
+    return Frame(alpha=alpha if "alpha" in outputs else None, overflow=overflow, **planes)
 
 
 def surface_depth(
@@ -197,12 +207,13 @@ def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: b
     """What listing and blending need of the camera, the number of splats and the settings."""
     on_cpu = jax.default_backend() == "cpu"
     tiles = -(-camera.width // config.tile_size) * -(-camera.height // config.tile_size)
+    chunk = 64 if 6 * count > 32 * tiles else 16
     limit = config.slots or 2 ** (17 if on_cpu else 21) // config.bands
     return BlendConfig(
         width=camera.width,
         height=camera.height,
         tile=config.tile_size,
-        chunk=config.chunk,
+        chunk=config.chunk or chunk,
         slots=slots_of(count, tiles, config.capacity, limit),
         capacity=config.capacity,
         tiles_at_once=config.tiles_at_once or (1 if on_cpu else 2048),
@@ -225,6 +236,13 @@ def colours(splats: Splats, camera: Camera, sh_degree: int | None = None) -> Flo
         directions = jnp.einsum("nij,ni->nj", splats.sh_rotations, directions)
     basis = sh_basis(directions, degree)
     return jnp.maximum(jnp.einsum("nk,nkc->nc", basis, splats.sh[:, : basis.shape[1]]) + 0.5, 0.0)
+
+
+def normals(splats: Splats, camera: Camera) -> Float[Array, "n 3"]:
+    """Shortest axis of each splat, in the world, on the side of the camera."""
+    axis = svd(splats.factors)[0][..., 2]
+    away = jnp.sum(axis * (splats.means - camera.position), 1, keepdims=True) > 0
+    return jnp.where(away, -axis, axis)
 
 
 def sh_degree_of(gaussians: Gaussians | Splats) -> int:

@@ -18,14 +18,14 @@ FLOORS = [
     {"splat", "matter"},
     {"tile_walks", "clamp", "shells", "relocation", "overlay", "mls_mpm", "io"},
     {"filling"},
-    {"segmentation", "particles", "solids", "reconstruct"},
+    {"segmentation", "particles", "solids", "reconstruct", "pruning"},
     {"scene"},
     {"cli"},
 ]
 FLOOR_OF = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
 # the two worlds meet in particles.py and solids.py only
 SPLATS = {"splat", "lists", "bands", "tiles", "tile_walks", "clamp", "segmentation", "relocation", "reconstruct"}
-SPLATS |= {"filling", "shells"}
+SPLATS |= {"filling", "shells", "pruning"}
 MATTER = {"matter", "mls_mpm", "transfers", "materials", "colliders"}
 
 

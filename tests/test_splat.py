@@ -57,8 +57,20 @@ def test_every_output_equals_the_dense_compositor(degree, antialias):
     scene, camera = make_scene(degree=degree, seed=degree)
     config = RenderConfig(antialias=antialias)
     membership = np.random.default_rng(1).random((60, 3))
-    frame = render(gaussians_of(scene), camera, config, outputs=OUTPUTS, object_weights=jnp.asarray(membership))
-    rgb, alpha, depth, surface, objects = dense(scene, camera, config, weights=membership)
+    channels = np.random.default_rng(2).normal(size=(60, 5))
+    extra = {"object_weights": jnp.asarray(membership), "features": jnp.asarray(channels)}
+    frame = render(gaussians_of(scene), camera, config, outputs=OUTPUTS, **extra)
+    factors = np.asarray(splat_module.as_splats(gaussians_of(scene)).factors, np.float64)
+    shortest = np.linalg.eigh(factors @ factors.transpose(0, 2, 1))[1][..., 0]
+    facing = np.sum(shortest * (scene["means"] - np.asarray(camera.position)), 1, keepdims=True) < 0
+    everything = np.concatenate([membership, channels, np.where(facing, shortest, -shortest)], 1)
+    rgb, alpha, depth, surface, planes = dense(scene, camera, config, weights=everything)
+    objects, features, normals = np.split(planes, [3, 8], axis=-1)
+    np.testing.assert_allclose(frame.features, features, atol=5e-5)
+    lit = np.linalg.norm(normals, axis=-1) > 0.05
+    assert lit.mean() > 0.2
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    np.testing.assert_allclose(np.asarray(frame.normals)[lit], normals[lit], atol=2e-3)
     # float32 rounding of colours of order 1 blended over at most 60 splats
     for ours, truth in ((frame.rgb, rgb), (frame.alpha, alpha), (frame.object_weights, objects)):
         assert np.abs(ours - truth).max() < 2e-5
@@ -462,6 +474,8 @@ def test_unknown_output_and_missing_object_weights_are_clear_errors():
     scene, camera = make_scene(count=2)
     with pytest.raises(InputError, match=r"outputs = \('colour',\): choose from rgb"):
         render(gaussians_of(scene), camera, outputs=("colour",))
+    with pytest.raises(InputError, match="pass features"):
+        render(gaussians_of(scene), camera, outputs=("features",))
     with pytest.raises(InputError, match="pass object_weights"):
         render(gaussians_of(scene), camera, outputs=("object_weights",))
     bad = Gaussians(np.zeros((1, 3)), np.zeros((1, 3)), np.ones((1, 4)), np.zeros(1), np.zeros((1, 5, 3)))

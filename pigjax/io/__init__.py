@@ -2,6 +2,7 @@
 
 from pigjax.io.cameras import Views, load_cameras, load_views
 from pigjax.io.files import read_json, write_json
+from pigjax.io.formats import load_gaussians
 from pigjax.io.images import contact_sheet, read_image, write_image
 from pigjax.io.masks import load_masks, save_masks
 from pigjax.io.ply import load_ply, load_points, read_ply, save_ply
@@ -13,6 +14,7 @@ __all__ = [
     "contact_sheet",
     "last_state",
     "load_cameras",
+    "load_gaussians",
     "load_masks",
     "load_ply",
     "load_points",

@@ -20,16 +20,16 @@ _REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(4))
 def load_ply(path: PathLike, *, drop_invalid: bool = False) -> Gaussians:
     """Gaussians from a PLY file in INRIA's layout (3DGS), SH degree 0 to 3, binary or ASCII. Host.
 
-    Properties that 3DGS does not know are ignored. With `drop_invalid`, splats that hold NaN or infinity or whose
-    quaternion is zero are left out, and a warning says how many; `read_ply` gives the number.
+    Properties that 3DGS does not know are ignored. A compressed PLY is decoded by the package gsply. With
+    `drop_invalid`, splats that hold NaN or infinity or whose quaternion is zero are left out, and a warning says how
+    many; `read_ply` gives the number.
 
     Raises:
         MissingFileError: there is no such file.
         InputError: not a PLY file, truncated, a property missing, no splats, or invalid values.
     """
     gaussians, dropped = read_ply(path, drop_invalid=drop_invalid)
-    if dropped:
-        warnings.warn(f"{path}: dropped {dropped} splats with NaN, inf or a zero quaternion.", stacklevel=2)
+    warn_of_dropped(path, dropped)
     return gaussians
 
 
@@ -41,18 +41,30 @@ def read_ply(path: PathLike, *, drop_invalid: bool = False) -> tuple[Gaussians, 
         InputError: not a PLY file, truncated, a property missing, no splats, or invalid values.
     """
     vertex = _read_vertices(path)
+    if "packed_position" in _names(vertex):
+        return gaussians_of(path, read_packed(path), drop_invalid=drop_invalid)
     rest_count = sum(name.startswith("f_rest_") for name in _names(vertex))
     if rest_count not in _REST_COUNTS:
         raise InputError(f"{path}: has {rest_count} f_rest properties; export it with SH degree 0 to 3 {_REST_COUNTS}.")
-    layout = _layout(rest_count)
-    fields = {field: _columns(path, vertex, names) for field, names in layout.items()}
-    valid = np.ones(len(vertex), bool)
-    for field, names in layout.items():
+    fields = {field: _columns(path, vertex, names) for field, names in _layout(rest_count).items()}
+    return gaussians_of(path, fields, drop_invalid=drop_invalid)
+
+
+def gaussians_of(path: PathLike, fields: dict[str, np.ndarray], *, drop_invalid: bool = False) -> tuple[Gaussians, int]:
+    """Gaussians from the columns of each field, and how many were dropped.
+
+    Raises:
+        InputError: no splats, or invalid values.
+    """
+    rest_count = fields["sh_rest"].shape[1]
+    total = len(fields["means"])
+    valid = np.ones(total, bool)
+    for field, names in _layout(rest_count).items():
         valid &= _finite_rows(path, fields[field], names, strict=not drop_invalid)
     valid &= _turned_rows(path, fields["quats"], strict=not drop_invalid)
     count = int(valid.sum())
     if count == 0:
-        raise InputError(f"{path}: the scene is empty ({len(vertex)} splats, none valid); give a file that holds some.")
+        raise InputError(f"{path}: the scene is empty ({total} splats, none valid); give a file that holds some.")
     kept = {field: values[valid] for field, values in fields.items()}
     sh_rest = kept["sh_rest"].reshape(count, 3, rest_count // 3).transpose(0, 2, 1)
     gaussians = Gaussians(
@@ -62,7 +74,41 @@ def read_ply(path: PathLike, *, drop_invalid: bool = False) -> tuple[Gaussians, 
         logit_opacities=jnp.asarray(kept["logit_opacities"][:, 0]),
         sh=jnp.asarray(np.concatenate([kept["sh_0"][:, None], sh_rest], axis=1)),
     )
-    return gaussians, len(vertex) - count
+    return gaussians, total - count
+
+
+def warn_of_dropped(path: PathLike, dropped: int) -> None:
+    """Say how many splats were left out, if any."""
+    if dropped:
+        warnings.warn(f"{path}: dropped {dropped} splats with NaN, inf or a zero quaternion.", stacklevel=3)
+
+
+def read_packed(path: PathLike) -> dict[str, np.ndarray]:
+    """Columns of each field of a compressed `.ply` or a `.spz`, by gsply.
+
+    Raises:
+        InputError: gsply is not installed, or cannot read the file.
+    """
+    path = existing(path, "file of Gaussians")
+    try:
+        import gsply
+    except ImportError:
+        raise InputError(f"{path}: a compressed file needs gsply: pip install 'pigjax[formats]'.") from None
+    try:
+        data = gsply.read_spz(path) if path.suffix.lower() == ".spz" else gsply.plyread(path)
+    except Exception as error:  # its decoders raise whatever numpy, gzip or struct do
+        raise InputError(f"{path}: damaged or of another kind ({error}); export it again.") from None
+    count = len(data.means)
+    rest = np.zeros((count, 0, 3)) if data.shN is None else np.asarray(data.shN)
+    fields = {
+        "means": data.means,
+        "sh_0": data.sh0,
+        "sh_rest": rest.transpose(0, 2, 1).reshape(count, -1),
+        "logit_opacities": np.reshape(data.opacities, (count, 1)),
+        "log_scales": data.scales,
+        "quats": data.quats,
+    }
+    return {name: np.asarray(values, np.float32) for name, values in fields.items()}
 
 
 def save_ply(path: PathLike, gaussians: Gaussians, *, ascii: bool = False) -> None:

@@ -79,6 +79,8 @@ def describe_file(path: Path) -> dict[str, str]:
         raise MissingFileError(f"{path}: does not exist; check the path.")
     if path.suffix == ".ply":
         return _describe_gaussians(io.read_ply(path, drop_invalid=True))
+    if path.suffix in (".splat", ".spz"):
+        return _describe_gaussians((io.load_gaussians(path), 0))
     if path.suffix == ".toml":
         scene = load_scene(path)
         moving = {name: entry.material or entry.model for name, entry in scene.objects.items() if not entry.fixed}

@@ -59,7 +59,7 @@ def read_inputs(scene: Scene) -> Inputs:
         SceneError: an object has no id.
     """
     spec = scene.input
-    gaussians = io.load_ply(scene.path(spec.gaussians))
+    gaussians = io.load_gaussians(scene.path(spec.gaussians))
     views = None
     if spec.views is not None:
         masks = True if spec.masks is None else scene.path(spec.masks)
