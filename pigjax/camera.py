@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pigjax.arrays import Vector, array_field, static_field
+from pigjax.linalg import quat_to_matrix
 
 
 class Camera(eqx.Module):
@@ -45,6 +46,15 @@ class Camera(eqx.Module):
         if self.world_to_cam.ndim != 3:
             raise TypeError("Camera is a single camera, not a batch: its world_to_cam has no leading axis.")
         return self.world_to_cam.shape[0]
+
+    def nudged(self, twist: Float[Array, "*batch 6"]) -> Camera:
+        """The camera turned by a small rotation vector and shifted, both in its own axes [rad, m]."""
+        half = twist[..., :3] / 2
+        rotation = quat_to_matrix(jnp.concatenate([jnp.ones_like(half[..., :1]), half], -1))
+        moved = jnp.einsum("...ij,...jk->...ik", rotation, self.world_to_cam[..., :3, :])
+        moved = moved.at[..., 3].add(twist[..., 3:])
+        world_to_cam = self.world_to_cam.at[..., :3, :].set(moved)
+        return Camera(world_to_cam, self.focal, self.centre, self.width, self.height)
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view at another resolution [px]."""

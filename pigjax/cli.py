@@ -26,11 +26,13 @@ from pigjax.errors import InputError, SimulationError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 _console = Console(stderr=True)
+_MOST_DEVICES = 8  # an image has too few rows of tiles for more
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")]
 
 
 def main() -> None:
     """Entry point: errors of the input become one line and exit code 2, of the simulation exit code 3."""
+    _one_device_per_core()
     try:
         app()
     except (InputError, SimulationError) as error:
@@ -39,6 +41,17 @@ def main() -> None:
     except KeyboardInterrupt:
         _console.print("stopped; run the same command again to go on from the last saved state.")
         sys.exit(130)
+
+
+def _one_device_per_core() -> None:
+    """On a CPU, XLA runs loops on one core per device; `pigjax.bands` shares an image among them."""
+    import os
+
+    import jax
+
+    if "JAX_NUM_CPU_DEVICES" not in os.environ and "XLA_FLAGS" not in os.environ:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        jax.config.update("jax_num_cpu_devices", min(cores, _MOST_DEVICES))
 
 
 @contextmanager
@@ -113,16 +126,38 @@ def reconstruct(
     sh_degree: Annotated[int, typer.Option(help="Bands of view-dependent colour.", min=0, max=3)] = 1,
     background: Annotated[float, typer.Option(help="Grey level behind the scene: 0 black, 1 white.")] = 0.0,
     max_size: Annotated[int | None, typer.Option(help="Shrink photos to this many pixels.")] = None,
+    start_splats: Annotated[int | None, typer.Option(help="Begin with fewer Gaussians and double them.")] = None,
+    masks: Annotated[bool, typer.Option(help="Read object_mask beside the photos.")] = False,
+    only: Annotated[int | None, typer.Option(help="Fit only what the masks give this id.")] = None,
+    random_background: Annotated[bool, typer.Option(help="A new colour each step behind what masks cover.")] = False,
+    refine_poses: Annotated[bool, typer.Option(help="Correct the training cameras too.")] = False,
+    previews: Annotated[int, typer.Option(help="Steps between preview pictures; 0 for none.", min=0)] = 0,
     seed: int = 0,
 ) -> None:
     """Fit Gaussians to photos; writes OUT/gaussians.ply, and goes on from OUT/checkpoint if it was stopped."""
+    import jax
+
     from pigjax import io
     from pigjax.reconstruct import FitConfig, reconstruct
     from pigjax.reconstruct import Progress as Step
+    from pigjax.splat import RenderConfig
 
-    loaded = io.load_views(views, max_size=max_size, background=background)
+    needs_masks = masks or only is not None or random_background
+    loaded = io.load_views(views, masks=needs_masks, max_size=max_size, background=background)
     points = io.load_points(loaded.points_path) if loaded.points_path else None
-    config = FitConfig(steps=steps, splats=splats, sh_degree=sh_degree, background=background, seed=seed)
+    config = FitConfig(
+        steps=steps,
+        splats=splats,
+        start_splats=start_splats,
+        sh_degree=sh_degree,
+        background=background,
+        object_id=only,
+        random_background=random_background,
+        pose_rate=1e-3 if refine_poses else 0.0,
+        preview_every=previews,
+        seed=seed,
+        render=RenderConfig(bands=jax.local_device_count()),
+    )
     out.mkdir(parents=True, exist_ok=True)
     with _progress("{task.fields[state]}") as bar:
         task, last = bar.add_task("reconstruct", total=steps, state=""), [""]
@@ -131,7 +166,9 @@ def reconstruct(
             last[0] = last[0] if step.psnr is None else f"  held-out {step.psnr:.2f} dB"
             bar.update(task, completed=step.step, state=f"loss {step.loss:.4f}{last[0]}")
 
-        result = reconstruct(loaded, config, points=points, checkpoint=out / "checkpoint", callback=tell)
+        result = reconstruct(
+            loaded, config, points=points, checkpoint=out / "checkpoint", previews=out / "previews", callback=tell
+        )
     io.save_ply(out / "gaussians.ply", result.gaussians)
     io.write_json(out / "report.json", {"psnr": result.psnr, "ssim": result.ssim, "mean_psnr": result.mean_psnr,
                                         "history": [step._asdict() for step in result.history]})  # fmt: skip
@@ -139,7 +176,9 @@ def reconstruct(
     for name in result.psnr:
         table.add_row(name, f"{result.psnr[name]:.2f}", f"{result.ssim[name]:.4f}")
     _console.print(table)
-    _console.print(f"mean PSNR {result.mean_psnr:.2f} dB; {out / 'gaussians.ply'}", highlight=False)
+    _console.print(
+        f"mean PSNR {result.mean_psnr:.2f} dB, SSIM {result.mean_ssim:.4f}; {out / 'gaussians.ply'}", highlight=False
+    )
 
 
 @app.command()

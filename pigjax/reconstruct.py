@@ -33,9 +33,14 @@ class FitConfig(eqx.Module):
 
     steps: int = static_field(default=3000)
     splats: int = static_field(default=15_000)
+    start_splats: int | None = static_field(default=None)  # doubled every `grow_every` steps up to `splats`; None: all
+    grow_every: int = static_field(default=500)
     sh_degree: int = static_field(default=1)
     ssim_weight: float = static_field(default=0.2)  # 0 traces no SSIM
     background: float = static_field(default=0.0)  # grey level behind the splats, as in the photos
+    object_id: int | None = static_field(default=None)  # fit only what the masks give this id
+    random_background: bool = static_field(default=False)  # a new colour each step behind what the masks cover
+    pose_rate: float = static_field(default=0.0)  # of corrections to the training cameras [rad, m]; 0 keeps the poses
     means_rate: float = static_field(default=4e-4)  # times the extent of the points, falls to a hundredth
     scales_rate: float = static_field(default=1e-2)
     quats_rate: float = static_field(default=2e-3)
@@ -48,6 +53,7 @@ class FitConfig(eqx.Module):
     opacity_regularizer: float = static_field(default=0.002)
     scale_regularizer: float = static_field(default=0.002)  # per extent of the points
     evaluate_every: int = static_field(default=500)
+    preview_every: int = static_field(default=0)  # steps between pictures of a view; 0 for none
     seed: int = static_field(default=0)
     render: RenderConfig = static_field(default=RenderConfig())
 
@@ -58,6 +64,8 @@ class Progress(NamedTuple):
     step: int
     loss: float
     psnr: float | None  # mean over held-out views [dB], where it was just evaluated
+    ssim: float | None
+    splats: int
     seconds: float  # spent on steps, compilation included
 
 
@@ -68,6 +76,7 @@ class Reconstruction:
     gaussians: Gaussians
     psnr: dict[str, float]  # per held-out view [dB]
     ssim: dict[str, float]
+    cameras: Camera  # of the training views, corrected where `pose_rate` asks for it
     history: list[Progress] = field(default_factory=list)
     relocated: int = 0
 
@@ -76,12 +85,19 @@ class Reconstruction:
         """Mean PSNR over the held-out views [dB]; NaN without any."""
         return float(np.mean(list(self.psnr.values()))) if self.psnr else float("nan")
 
+    @property
+    def mean_ssim(self) -> float:
+        """Mean SSIM over the held-out views; NaN without any."""
+        return float(np.mean(list(self.ssim.values()))) if self.ssim else float("nan")
+
 
 class FitState(eqx.Module):
     """All that a resumed run needs; the random numbers follow from the step."""
 
     gaussians: Gaussians
     optimizer: Any
+    poses: Float[Array, "v 6"] | None  # corrections of the training cameras
+    pose_optimizer: Any
     step: Int[Array, ""]
     relocated: Int[Array, ""]
 
@@ -137,58 +153,143 @@ def reconstruct(
     *,
     points: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]] | None = None,
     checkpoint: Path | None = None,
+    previews: Path | None = None,
     callback: Callable[[Progress], None] | None = None,
 ) -> Reconstruction:
     """Fit Gaussians to the training views, and score the held-out ones (split "test"). Host.
 
     Args:
-        views: photos with cameras.
+        views: photos with cameras, and with masks where the settings ask for them.
         config: steps, splats and rates.
         points: positions [m] and colours of sparse points; None starts from random ones.
         checkpoint: file that is written at every evaluation; if it exists the run goes on from it, with the same
             result as an unbroken one.
+        previews: folder for a picture of the first held-out view beside its photo every `config.preview_every` steps.
         callback: told the progress every few dozen steps.
 
     Raises:
-        InputError: no training views, or too few points.
+        InputError: no training views, too few points, or no masks where the settings need them.
     """
     train = views.subset("train") if "train" in views.splits else views
     held_out = views.subset("test") if "test" in views.splits else None
     if points is None:
         points = random_points(train.cameras, min(config.splats, 5000), seed=config.seed)
-    gaussians = start_gaussians(*points, config.splats, config.sh_degree, seed=config.seed)
     extent = float(np.linalg.norm(np.std(points[0], axis=0))) or 1.0
-    optimizer = _optimizer(config, extent)
-    zero = jnp.zeros((), jnp.int32)
-    state = FitState(gaussians, optimizer.init(gaussians), zero, zero)
-    if checkpoint is not None and checkpoint.exists():
-        state = io.load_pytree(checkpoint, state)
+    optimizers = _optimizer(config, extent), optax.adam(config.pose_rate)
 
-    images = jnp.asarray(train.images)
-    result = Reconstruction(state.gaussians, {}, {})
+    def start(count: int) -> FitState:
+        gaussians = start_gaussians(*points, count, config.sh_degree, seed=config.seed)
+        poses = jnp.zeros((len(train), 6)) if config.pose_rate else None
+        zero = jnp.zeros((), jnp.int32)
+        return FitState(gaussians, optimizers[0].init(gaussians), poses, optimizers[1].init(poses), zero, zero)
+
+    state = start(_count_at(0, config))
+    if checkpoint is not None and checkpoint.exists():
+        state = _resume(checkpoint, start, config)
+    photos = _photos(train, config)
+    scored = None if held_out is None else (held_out, _photos(held_out, config))
+    result = Reconstruction(state.gaussians, {}, {}, train.cameras)
     begun = time.perf_counter()
     while (step := int(state.step)) < config.steps:
-        stop = min(config.steps, _next_multiple(step, config.relocate_every, config.evaluate_every, 50))
-        state, loss = _train(state, train.cameras, images, config, optimizer, extent, stop - step)
+        if (count := _count_at(step, config)) > len(state.gaussians):
+            state = _grow(state, count, config)
+        stop = min(config.steps, _next_stop(step, config))
+        state, loss = _train(state, train.cameras, photos, config, optimizers, extent, stop - step)
         if config.relocate_every and stop % config.relocate_every == 0 and stop <= config.relocate_until * config.steps:
             state = _relocate(state, config)
-        score = None
+        psnrs: dict[str, float] = {}
+        ssims: dict[str, float] = {}
         if stop % config.evaluate_every == 0 or stop == config.steps:
-            score = _score(state.gaussians, held_out, config)[0]
+            psnrs, ssims = _score(state.gaussians, scored, config)
             if checkpoint is not None:
                 io.save_pytree(checkpoint, state)
-        mean = None if score is None else float(np.mean(list(score.values()))) if score else None
-        result.history.append(Progress(stop, float(loss), mean, time.perf_counter() - begun))
+        if previews is not None and config.preview_every and stop % config.preview_every == 0:
+            _preview(previews / f"{stop:06d}.png", state.gaussians, held_out or train, config)
+        spent = time.perf_counter() - begun
+        result.history.append(Progress(stop, float(loss), _mean(psnrs), _mean(ssims), len(state.gaussians), spent))
         if callback is not None:
             callback(result.history[-1])
-    psnrs, ssims = _score(state.gaussians, held_out, config)
+    psnrs, ssims = _score(state.gaussians, scored, config)
     return replace(
         result,
         gaussians=state.gaussians,
         psnr=psnrs,
         ssim=ssims,
+        cameras=train.cameras if state.poses is None else train.cameras.nudged(state.poses),
         relocated=int(state.relocated),
     )
+
+
+def _mean(scores: dict[str, float]) -> float | None:
+    return float(np.mean(list(scores.values()))) if scores else None
+
+
+class _Photos(NamedTuple):
+    """Training images; with a matte they are black where it is 0."""
+
+    images: Float[Array, "v h w 3"]
+    mattes: Float[Array, "v h w 1"] | None
+
+
+def _photos(views: io.Views, config: FitConfig) -> _Photos:
+    images = jnp.asarray(views.images)
+    if config.object_id is None and not config.random_background:
+        return _Photos(images, None)
+    if views.masks is None:
+        raise InputError(
+            "FitConfig.object_id and random_background need masks: load the views with load_views(..., masks=True)."
+        )
+    masks = np.asarray(views.masks)
+    matte = masks > 0 if config.object_id is None else masks == config.object_id
+    if not matte.any():
+        raise InputError(f"FitConfig.object_id = {config.object_id}: no mask of these views has that id.")
+    mattes = jnp.asarray(matte[..., None], images.dtype)
+    return _Photos(images * mattes, mattes)
+
+
+def _count_at(step: int, config: FitConfig) -> int:
+    """Splats from this step on."""
+    first = config.splats if config.start_splats is None else min(config.start_splats, config.splats)
+    return min(config.splats, first * 2 ** min(step // config.grow_every, 40))
+
+
+def _resume(checkpoint: Path, start: Callable[[int], FitState], config: FitConfig) -> FitState:
+    """State of a checkpoint, whose number of splats is one of those that the settings pass through."""
+    counts = {_count_at(step, config) for step in range(0, config.steps + 1, config.grow_every)}
+    for count in sorted(counts - {config.splats}):
+        try:
+            return io.load_pytree(checkpoint, start(count))
+        except InputError:
+            continue
+    return io.load_pytree(checkpoint, start(config.splats))
+
+
+def _grow(state: FitState, count: int, config: FitConfig) -> FitState:
+    """More splats: dead ones, which relocation puts to work at once. Their moments start from zero."""
+    old = len(state.gaussians)
+
+    def longer(leaf):
+        if eqx.is_inexact_array(leaf) and leaf.ndim and leaf.shape[0] == old:
+            return jnp.pad(leaf, [(0, count - old)] + [(0, 0)] * (leaf.ndim - 1))
+        return leaf
+
+    gaussians, moments = jax.tree.map(longer, (state.gaussians, state.optimizer))
+    dead = jnp.where(jnp.arange(count) < old, gaussians.logit_opacities, -10.0)
+    gaussians = eqx.tree_at(lambda g: g.logit_opacities, gaussians, dead)
+    return _relocate(replace(state, gaussians=gaussians, optimizer=moments), config)
+
+
+def _preview(path: Path, gaussians: Gaussians, views: io.Views, config: FitConfig) -> None:
+    frame = render(gaussians, views.cameras[0], config.render, background=config.background, outputs=("rgb",))
+    assert frame.rgb is not None
+    picture = np.clip(np.concatenate([np.asarray(views.images[0]), np.asarray(frame.rgb)], 1), 0, 1)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    io.write_image(path, picture)
+
+
+def _next_stop(step: int, config: FitConfig) -> int:
+    grows = config.grow_every if config.start_splats is not None else 0
+    return _next_multiple(step, config.relocate_every, config.evaluate_every, config.preview_every, grows, 50)
 
 
 def _next_multiple(step: int, *periods: int) -> int:
@@ -216,9 +317,12 @@ def _band_rates(step: Int[Array, ""], config: FitConfig) -> Float[Array, "k 1"]:
     return jnp.where(step >= band * config.band_every, np.where(band == 0, 1.0, 0.05), 0.0)[:, None]
 
 
-def _loss(gaussians: Gaussians, camera: Camera, image: Float[Array, "h w 3"], config: FitConfig, extent: float):
-    frame = render(gaussians, camera, config.render, background=config.background, outputs=("rgb",))
+def _loss(fitted, camera: Camera, photo: _Photos, background, config: FitConfig, extent: float):
+    gaussians, twist = fitted
+    camera = camera if twist is None else camera.nudged(twist)
+    frame = render(gaussians, camera, config.render, background=background, outputs=("rgb",))
     assert frame.rgb is not None
+    image = photo.images if photo.mattes is None else photo.images + (1 - photo.mattes) * background
     loss = (1 - config.ssim_weight) * jnp.mean(jnp.abs(frame.rgb - image))
     if config.ssim_weight:
         loss += config.ssim_weight * (1 - ssim(frame.rgb, image))
@@ -228,27 +332,38 @@ def _loss(gaussians: Gaussians, camera: Camera, image: Float[Array, "h w 3"], co
 
 
 @eqx.filter_jit
-def _train(state: FitState, cameras: Camera, images, config: FitConfig, optimizer, extent: float, count: int):
+def _train(state: FitState, cameras: Camera, photos: _Photos, config: FitConfig, optimizers, extent: float, count: int):
     """`count` steps: the state after them, and their mean loss."""
-    views = images.shape[0]
+    views = photos.images.shape[0]
 
     def one(state: FitState, _):
         key = jax.random.fold_in(jax.random.key(config.seed), state.step)
         # every view once per round, in a new order each round
         order = jax.random.permutation(jax.random.fold_in(jax.random.key(config.seed + 1), state.step // views), views)
         view = order[state.step % views]
-        camera = cameras[view]
-        loss, gradient = eqx.filter_value_and_grad(_loss)(state.gaussians, camera, images[view], config, extent)
-        updates, moments = optimizer.update(gradient, state.optimizer, state.gaussians)
+        background: Any = config.background
+        if config.random_background:
+            background = jax.random.uniform(jax.random.fold_in(key, 1), (3,))
+
+        def loss(fitted):
+            gaussians, poses = fitted
+            twist = None if poses is None else poses[view]
+            photo = jax.tree.map(lambda array: array[view], photos)
+            return _loss((gaussians, twist), cameras[view], photo, background, config, extent)
+
+        value, (gradient, pose_gradient) = eqx.filter_value_and_grad(loss)((state.gaussians, state.poses))
+        updates, moments = optimizers[0].update(gradient, state.optimizer, state.gaussians)
         updates = eqx.tree_at(lambda g: g.sh, updates, updates.sh * _band_rates(state.step, config))
         gaussians = optax.apply_updates(state.gaussians, updates)
         if config.noise:
             rate = config.means_rate * extent * 0.01 ** (state.step / config.steps)
             gaussians = shake(gaussians, key, config.noise * rate)
-        return FitState(gaussians, moments, state.step + 1, state.relocated), loss
+        pose_updates, pose_moments = optimizers[1].update(pose_gradient, state.pose_optimizer, state.poses)
+        poses = optax.apply_updates(state.poses, pose_updates)
+        return FitState(gaussians, moments, poses, pose_moments, state.step + 1, state.relocated), value
 
-    state, loss = lax.scan(one, state, length=count)
-    return state, jnp.mean(loss)
+    state, losses = lax.scan(one, state, length=count)
+    return state, jnp.mean(losses)
 
 
 @eqx.filter_jit
@@ -262,17 +377,20 @@ def _relocate(state: FitState, config: FitConfig) -> FitState:
             return moment * keep.reshape(-1, *([1] * (moment.ndim - 1)))
         return moment
 
-    return FitState(gaussians, jax.tree.map(forget, state.optimizer), state.step, state.relocated + moved)
+    moments = jax.tree.map(forget, state.optimizer)
+    return replace(state, gaussians=gaussians, optimizer=moments, relocated=state.relocated + moved)
 
 
 def _score(
-    gaussians: Gaussians, held_out: io.Views | None, config: FitConfig
+    gaussians: Gaussians, held_out: tuple[io.Views, _Photos] | None, config: FitConfig
 ) -> tuple[dict[str, float], dict[str, float]]:
     """PSNR [dB] and SSIM of each held-out view by name."""
     if held_out is None:
         return {}, {}
-    psnrs, ssims = _score_views(gaussians, held_out.cameras, jnp.asarray(held_out.images), config)
-    return dict(zip(held_out.names, map(float, psnrs))), dict(zip(held_out.names, map(float, ssims)))
+    views, photos = held_out
+    images = photos.images if photos.mattes is None else photos.images + (1 - photos.mattes) * config.background
+    psnrs, ssims = _score_views(gaussians, views.cameras, images, config)
+    return dict(zip(views.names, map(float, psnrs))), dict(zip(views.names, map(float, ssims)))
 
 
 @eqx.filter_jit
