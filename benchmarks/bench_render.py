@@ -91,11 +91,11 @@ def row(text, bands):
     if not options.forward_only:
         compile_both, both, _ = measure(jax.value_and_grad(lambda g, c: loss(g, c, config)), *scene)
         line += f"  fwd+bwd {both * 1e3:8.1f} ms (compile {compile_both:.1f} s)"
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     if count * width * height <= 100_000 * 512**2:
         truth = jax.jit(lambda g, c: render(g, c, EXACT))(*ball(count, width, height))
         worst = float(jnp.abs(jax.device_get(frame.rgb) - truth.rgb).max())
         line += f"  error {psnr(frame.rgb, truth.rgb):.1f} dB, worst {worst:.1e}"
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"{line}  peak so far {peak:.2f} GiB", flush=True)
 
 

@@ -276,6 +276,74 @@ def test_degenerate_splats_draw_right_and_have_finite_gradients(case):
     assert all(np.isfinite(g).all() for g in gradients)
 
 
+SMOOTH_CASES = {
+    "needle": {"scales": [2e-5, 2e-1, 2e-5]},
+    "full opacity": {"opacities": 1.0},
+    "almost no opacity": {"opacities": 1e-12},
+    "covers everything": {"scales": [50.0, 50.0, 50.0]},
+    "equal depths": {"means": [0.0, 0.0, 0.0]},
+    "centre outside of the image": {"means": "aside", "scales": [0.4, 0.4, 0.4]},
+    "behind the camera": {"means": "behind"},
+    "just ahead of the near plane": {"means": "near"},
+}
+
+
+@pytest.fixture(scope="module")
+def splats_loss():
+    """Loss over splats and camera without thresholds, compiled once in float64, and its gradient."""
+    with jax.enable_x64(True):
+        weights = jnp.asarray(np.random.default_rng(2).normal(size=(12, 20, 4)))
+        config = RenderConfig(alpha_min=1e-14, alpha_max=1.0, transmittance_min=0.0)
+
+        def loss(inputs):
+            means, scales, quats, opacities, sh, camera = inputs
+            factors = splat_module.quat_to_matrix(quats) * scales[:, None]
+            frame = render(splat_module.Splats(means, factors, opacities, sh), camera, config)
+            return jnp.sum(jnp.concatenate([frame.rgb, frame.alpha[..., None]], -1) * weights)
+
+        return jax.jit(loss), jax.jit(jax.grad(loss))
+
+
+@pytest.mark.parametrize("case", SMOOTH_CASES)
+def test_gradients_of_degenerate_splats_equal_central_differences(x64, splats_loss, case):
+    """Along random directions of every input at once, wherever the picture is a smooth function of it."""
+    scene, camera = make_scene(count=8, width=20, height=12, degree=1)
+    position, axes = np.asarray(camera.position), np.asarray(camera.world_to_cam)[:3, :3]
+    places = {
+        "aside": position + 2 * axes[2] + 0.9 * axes[0],
+        "behind": position - axes[2],
+        "near": position + 0.011 * axes[2],
+    }
+    for name, value in SMOOTH_CASES[case].items():
+        # two splats of equal depth change places when they move; else one is enough
+        scene[name][: 2 if case == "equal depths" else 1] = places[value] if isinstance(value, str) else value
+    names = ("means", "scales", "quats", "opacities", "sh", "camera")
+    inputs = (*(jnp.asarray(scene[name]) for name in names[:5]), camera)
+    loss, slope = splats_loss
+    gradient = slope(inputs)
+    rng = np.random.default_rng(5)
+    for which, name in enumerate(names):
+        if case == "equal depths" and name in ("means", "camera"):
+            continue
+        value, ours = (tree[which].world_to_cam if name == "camera" else tree[which] for tree in (inputs, gradient))
+        step = rng.normal(size=value.shape) * np.abs(value)
+        if name == "opacities":
+            step = -np.abs(step)  # they end at 1
+        if name == "camera":
+            step[3] = 0
+
+        def at(t, which=which, name=name, value=value, step=step):
+            moved = value + t * step
+            if name == "camera":
+                moved = Camera(moved, camera.focal, camera.centre, camera.width, camera.height)
+            return float(loss((*inputs[:which], moved, *inputs[which + 1 :])))
+
+        h = 1e-6
+        one_sided = (-1.5 * at(0) + 2 * at(h) - 0.5 * at(2 * h)) / h
+        difference = one_sided if name == "opacities" else (at(h) - at(-h)) / (2 * h)
+        np.testing.assert_allclose(np.sum(np.asarray(ours) * step), difference, rtol=1e-4, atol=1e-6, err_msg=name)
+
+
 def test_empty_scene_is_background_and_one_pixel_image_works():
     scene, camera = make_scene(count=3, width=1, height=1, degree=0)
     gaussians = gaussians_of(scene)
