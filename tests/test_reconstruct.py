@@ -1,8 +1,10 @@
 """Reconstruction: relocation keeps the picture, training climbs, and a broken run ends like an unbroken one."""
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,7 @@ import pytest
 from pigjax import io
 from pigjax.camera import orbit
 from pigjax.errors import InputError
+from pigjax.linalg import matrix_to_quat
 from pigjax.reconstruct import FitConfig, random_points, reconstruct, start_gaussians
 from pigjax.relocation import relocate, shake, split_opacity
 from pigjax.splat import Gaussians, render
@@ -203,3 +206,55 @@ def test_pose_refinement_takes_back_a_shifted_camera(views):
     print(f"pose error {before:.3f} before, {after:.3f} after")
     # the cloud may drift with the cameras, so the way back is not all of it
     assert after < 0.5 * before
+
+
+TABLETOP = Path(__file__).parents[1] / "examples" / "tabletop"
+
+
+def as_inria(views, folder):
+    poses = np.linalg.inv(np.asarray(views.cameras.world_to_cam, np.float64))
+    entries = [
+        {
+            "id": k,
+            "img_name": name,
+            "width": 256,
+            "height": 256,
+            "position": pose[:3, 3].tolist(),
+            "rotation": pose[:3, :3].tolist(),
+            "fx": float(views.cameras.focal[k, 0]),
+            "fy": float(views.cameras.focal[k, 1]),
+        }
+        for k, (name, pose) in enumerate(zip(views.names, poses))
+    ]
+    (folder / "cameras.json").write_text(json.dumps(entries))
+
+
+def as_colmap(views, folder):
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True)
+    fx, fy = np.asarray(views.cameras.focal[0], np.float64)
+    cx, cy = np.asarray(views.cameras.centre[0], np.float64)
+    (model / "cameras.txt").write_text(f"1 PINHOLE 256 256 {fx} {fy} {cx} {cy}\n")
+    lines = []
+    for k, (name, pose) in enumerate(zip(views.names, np.asarray(views.cameras.world_to_cam))):
+        quat = np.asarray(matrix_to_quat(jnp.asarray(pose[:3, :3])), np.float64)
+        lines.append(" ".join(map(str, [k + 1, *quat, *pose[:3, 3], 1, f"{name}.png"])) + "\n\n")
+    (model / "images.txt").write_text("".join(lines))
+    (model / "points3D.txt").write_text("1 0 0 0 0 0 0 0\n")
+
+
+@pytest.mark.parametrize("write", [as_inria, as_colmap])
+def test_every_kind_of_capture_gives_the_same_reconstruction(tmp_path, write):
+    """Real photos, their cameras said once as nerfstudio's and once as another format."""
+    truth = io.load_views(TABLETOP, max_size=64, background=1.0)
+    write(io.load_views(TABLETOP), tmp_path)
+    (tmp_path / "images").symlink_to(TABLETOP / "images")
+    other = io.load_views(tmp_path, max_size=64, background=1.0)
+    assert other.names == truth.names
+    config = FitConfig(steps=50, splats=1500, sh_degree=0, background=1.0, noise=0.0, relocate_every=0)
+    points = io.load_points(TABLETOP / "sparse_pc.ply")
+    ours = reconstruct(replace(other, splits=truth.splits), config, points=points)
+    expected = reconstruct(truth, config, points=points)
+    print(f"{write.__name__}: {ours.mean_psnr:.2f} dB, nerfstudio {expected.mean_psnr:.2f} dB")
+    assert expected.mean_psnr > 16
+    assert abs(ours.mean_psnr - expected.mean_psnr) < 0.1
