@@ -24,8 +24,7 @@ def in_bands(composite):
 
     def sharded(table, boxes: Boxes, tau, config: BlendConfig):
         height = -(-config.rows // config.bands) * config.tile
-        capacity = None if config.capacity is None else config.capacity // config.bands
-        band = dataclasses.replace(config, height=height, capacity=capacity, bands=1)
+        band = dataclasses.replace(config, height=height, bands=1)
 
         def one(table, boxes, tau):
             top = lax.axis_index(_AXIS) * band.rows
@@ -42,6 +41,11 @@ def in_bands(composite):
         return planes, overflow.sum()
 
     return sharded
+
+
+def replicate(tree, bands: int):
+    """Arrays put whole on each device of the bands (host), so that later calls find them where they are needed."""
+    return tree if bands == 1 else jax.device_put(tree, NamedSharding(band_mesh(bands), PartitionSpec()))
 
 
 def spread(tree, bands: int):

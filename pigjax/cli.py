@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -36,7 +38,7 @@ def main() -> None:
     try:
         app()
     except (InputError, SimulationError) as error:
-        _console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
+        _console.print(f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
         sys.exit(2 if isinstance(error, InputError) else 3)
     except KeyboardInterrupt:
         _console.print("stopped; run the same command again to go on from the last saved state.")
@@ -113,8 +115,8 @@ def _run(path: Path, out: Path) -> None:
         f" {sizes['frames']} frames of {sizes['substeps_per_frame']} substeps"
     )
     for warning in report.warnings:
-        _console.print(f"[yellow]note:[/] {warning}", highlight=False)
-    _console.print(f"video: {report.files['video']}", highlight=False)
+        _console.print(f"[yellow]note:[/] {escape(str(warning))}", highlight=False)
+    _console.print(f"video: {report.files['video']}", highlight=False, markup=False)
 
 
 @app.command()
@@ -126,11 +128,12 @@ def reconstruct(
     sh_degree: Annotated[int, typer.Option(help="Bands of view-dependent colour.", min=0, max=3)] = 1,
     background: Annotated[float, typer.Option(help="Grey level behind the scene: 0 black, 1 white.")] = 0.0,
     max_size: Annotated[int | None, typer.Option(help="Shrink photos to this many pixels.")] = None,
-    start_splats: Annotated[int | None, typer.Option(help="Begin with fewer Gaussians and double them.")] = None,
-    masks: Annotated[bool, typer.Option(help="Read object_mask beside the photos.")] = False,
+    start_splats: Annotated[
+        int | None, typer.Option(help="Begin with fewer Gaussians and double them during the first half.", min=4)
+    ] = None,
     only: Annotated[int | None, typer.Option(help="Fit only what the masks give this id.")] = None,
     random_background: Annotated[bool, typer.Option(help="A new colour each step behind what masks cover.")] = False,
-    refine_poses: Annotated[bool, typer.Option(help="Correct the training cameras too.")] = False,
+    refine_poses: Annotated[bool, typer.Option(help="Correct training cameras, into OUT/poses.json.")] = False,
     previews: Annotated[int, typer.Option(help="Steps between preview pictures; 0 for none.", min=0)] = 0,
     seed: int = 0,
 ) -> None:
@@ -142,18 +145,20 @@ def reconstruct(
     from pigjax.reconstruct import Progress as Step
     from pigjax.splat import RenderConfig
 
-    needs_masks = masks or only is not None or random_background
+    needs_masks = only is not None or random_background
+    doublings = max(math.ceil(math.log2(splats / start_splats)), 1) if start_splats else 1
     loaded = io.load_views(views, masks=needs_masks, max_size=max_size, background=background)
     points = io.load_points(loaded.points_path) if loaded.points_path else None
     config = FitConfig(
         steps=steps,
         splats=splats,
         start_splats=start_splats,
+        grow_every=max(steps // (2 * doublings), 1),
         sh_degree=sh_degree,
         background=background,
         object_id=only,
         random_background=random_background,
-        pose_rate=1e-3 if refine_poses else 0.0,
+        pose_rate=5e-4 if refine_poses else 0.0,
         preview_every=previews,
         seed=seed,
         render=RenderConfig(bands=jax.local_device_count()),
@@ -169,7 +174,11 @@ def reconstruct(
         result = reconstruct(
             loaded, config, points=points, checkpoint=out / "checkpoint", previews=out / "previews", callback=tell
         )
-    io.save_ply(out / "gaussians.ply", result.gaussians)
+    ply = out / "gaussians.ply"
+    io.save_ply(ply, result.gaussians)
+    if refine_poses:
+        poses = dict(zip(result.trained_on, result.cameras.world_to_cam.tolist()))
+        io.write_json(out / "poses.json", {"world_to_cam": poses})
     io.write_json(out / "report.json", {"psnr": result.psnr, "ssim": result.ssim, "mean_psnr": result.mean_psnr,
                                         "history": [step._asdict() for step in result.history]})  # fmt: skip
     table = Table("held-out view", "PSNR dB", "SSIM")
@@ -204,11 +213,11 @@ def segment(
     for number, count in counts.items():
         table.add_row(str(number), known.get(number, "never seen" if number < 0 else ""), str(count))
     _console.print(table)
-    _console.print(f"written to {out}", highlight=False)
+    _console.print(f"written to {out}", highlight=False, markup=False)
 
 
 @app.command()
-def info(path: Annotated[Path, typer.Argument(help="A .ply, a scene file, or posed photos.")]) -> None:
+def info(path: Annotated[Path, typer.Argument(help="A .ply, .splat or .spz, a scene file, or posed photos.")]) -> None:
     """Say what a file holds."""
     from pigjax.scene.objects import describe_file
 

@@ -16,7 +16,6 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.arrays import static_field
-from pigjax.errors import InputError
 
 SHAPE_COLUMNS = 6  # of a splat's row: x, y, conic xx xy yy, log opacity; features follow
 _KEY_LIMIT = 2**31  # tile and slot share one int32 sort key below it
@@ -49,7 +48,7 @@ class BlendConfig(eqx.Module):
     tile: int = static_field()
     chunk: int = static_field()
     slots: int = static_field()  # box/tile pairs sorted in one pass
-    capacity: int | None = static_field()  # box/tile pairs listed for one image, None for all of them
+    capacity: int | None = static_field()  # box/tile pairs listed for an image or band, None for all that are seen
     tiles_at_once: int = static_field()
     bands: int = static_field()  # devices that share the image
     alpha_min: float = static_field()
@@ -93,17 +92,11 @@ class TileLists(eqx.Module):
 
 
 def slots_of(count: int, tiles: int, capacity: int | None, limit: int) -> int:
-    """Static size of a pass: 6 pairs per splat up to `limit`, but a splat that covers every tile has to fit.
+    """Static size of a pass: 6 pairs per splat up to `limit` and to what one sort key holds.
 
-    Raises:
-        InputError: the image has too many tiles for one sort key.
+    A splat that covers every tile has to fit whatever that says.
     """
-    slots = max(tiles, min(6 * count, limit, capacity or limit))
-    if (tiles + 1) * max(slots, tiles) >= _KEY_LIMIT:
-        slots = (_KEY_LIMIT - 1) // (tiles + 1)
-    if slots < tiles:
-        raise InputError(f"the image has {tiles} tiles, more than the renderer can sort: use a larger tile_size.")
-    return slots
+    return max(tiles, min(6 * count, limit, capacity or limit, (_KEY_LIMIT - 1) // (tiles + 1)))
 
 
 def front_to_back(projected: Projected, config: BlendConfig) -> Boxes:

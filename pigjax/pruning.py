@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from pigjax import io
-from pigjax.camera import Camera
+from pigjax.camera import Camera, stack_cameras
 from pigjax.errors import InputError
 from pigjax.splat import Gaussians, RenderConfig, render
 
@@ -52,6 +52,8 @@ def prune(
     if budget < 1:
         raise InputError(f"budget = {budget}: keep 1 Gaussian or more.")
     cameras = views.cameras if isinstance(views, io.Views) else views
+    if cameras.world_to_cam.ndim == 2:
+        cameras = stack_cameras([cameras])
     score = np.asarray(contributions(gaussians, cameras, config))
     kept = np.sort(np.argsort(-score, kind="stable")[:budget])
     return jax.tree.map(lambda values: values[kept], gaussians)

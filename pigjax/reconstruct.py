@@ -15,17 +15,16 @@ import numpy as np
 import optax
 from jax import lax
 from jaxtyping import Array, Float, Int
-from scipy.spatial import cKDTree
 
 from pigjax import io
 from pigjax.arrays import static_field
+from pigjax.bands import replicate
 from pigjax.camera import Camera
 from pigjax.errors import InputError
 from pigjax.metrics import psnr, ssim
 from pigjax.relocation import relocate, shake
 from pigjax.splat import Gaussians, RenderConfig, render
-
-_DC = 0.28209479177387814
+from pigjax.starts import random_points, start_gaussians
 
 
 class FitConfig(eqx.Module):
@@ -40,7 +39,7 @@ class FitConfig(eqx.Module):
     background: float = static_field(default=0.0)  # grey level behind the splats, as in the photos
     object_id: int | None = static_field(default=None)  # fit only what the masks give this id
     random_background: bool = static_field(default=False)  # a new colour each step behind what the masks cover
-    pose_rate: float = static_field(default=0.0)  # of corrections to the training cameras [rad, m]; 0 keeps the poses
+    pose_rate: float = static_field(default=0.0)  # of the training cameras [rad, extent]; 0 keeps their poses
     means_rate: float = static_field(default=4e-4)  # times the extent of the points, falls to a hundredth
     scales_rate: float = static_field(default=1e-2)
     quats_rate: float = static_field(default=2e-3)
@@ -56,6 +55,19 @@ class FitConfig(eqx.Module):
     preview_every: int = static_field(default=0)  # steps between pictures of a view; 0 for none
     seed: int = static_field(default=0)
     render: RenderConfig = static_field(default=RenderConfig())
+
+    def __check_init__(self):
+        if self.start_splats is not None:
+            if self.start_splats < 4 or self.grow_every < 1:
+                raise InputError(
+                    f"FitConfig.start_splats = {self.start_splats}, grow_every = {self.grow_every}: start with 4 splats"
+                    " or more, and let a step or more pass between doublings."
+                )
+            if (reached := _count_at(self.steps - 1, self)) < self.splats:
+                raise InputError(
+                    f"FitConfig.start_splats = {self.start_splats} doubles to {reached} of splats = {self.splats}"
+                    f" within {self.steps} steps: lower grow_every = {self.grow_every}, or start with more."
+                )
 
 
 class Progress(NamedTuple):
@@ -76,7 +88,8 @@ class Reconstruction:
     gaussians: Gaussians
     psnr: dict[str, float]  # per held-out view [dB]
     ssim: dict[str, float]
-    cameras: Camera  # of the training views, corrected where `pose_rate` asks for it
+    cameras: Camera  # of the training views, corrected where `pose_rate` asks for it; the held-out ones stay
+    trained_on: tuple[str, ...]  # their names
     history: list[Progress] = field(default_factory=list)
     relocated: int = 0
 
@@ -102,51 +115,6 @@ class FitState(eqx.Module):
     relocated: Int[Array, ""]
 
 
-def start_gaussians(
-    points: Float[np.ndarray, "n 3"], rgb: Float[np.ndarray, "n 3"], count: int, sh_degree: int, *, seed: int = 0
-) -> Gaussians:
-    """Small round Gaussians on sparse points, repeated with jitter up to `count`. Host.
-
-    Raises:
-        InputError: fewer than 4 points.
-    """
-    if len(points) < 4:
-        raise InputError(f"points: {len(points)} given; a reconstruction starts from at least 4.")
-    rng = np.random.default_rng(seed)
-    pick = np.concatenate(
-        [np.arange(min(count, len(points))), rng.integers(len(points), size=max(count - len(points), 0))]
-    )
-    gap = cKDTree(points).query(points, k=4)[0][:, 1:].mean(1)[pick]
-    jitter = rng.normal(size=(count, 3)) * 0.5 * gap[:, None] * (np.arange(count) >= len(points))[:, None]
-    scale = gap * (len(points) / max(count, len(points))) ** 0.5 * 0.7
-    sh = np.zeros((count, (sh_degree + 1) ** 2, 3))
-    sh[:, 0] = (rgb[pick] - 0.5) / _DC
-    quats = np.tile([1.0, 0, 0, 0], (count, 1))
-    values = (
-        points[pick] + jitter,
-        np.log(np.maximum(scale, 1e-6))[:, None].repeat(3, 1),
-        quats,
-        np.full(count, -1.4),
-        sh,
-    )
-    return Gaussians(*(jnp.asarray(v, jnp.float32) for v in values))
-
-
-def random_points(
-    cameras: Camera, count: int, *, seed: int = 0
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Grey points in the ball that the cameras look at, for captures without sparse points. Host."""
-    rng = np.random.default_rng(seed)
-    position, forward = np.asarray(cameras.position), np.asarray(cameras.world_to_cam)[:, 2, :3]
-    # the point nearest to all optical axes
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    centre = np.linalg.lstsq(across.sum(0), np.einsum("vij,vj->i", across, position), rcond=None)[0]
-    radius = 0.5 * np.linalg.norm(position - centre, axis=1).mean()
-    direction = rng.normal(size=(count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return centre + direction * radius * rng.random((count, 1)) ** (1 / 3), np.full((count, 3), 0.5)
-
-
 def reconstruct(
     views: io.Views,
     config: FitConfig = FitConfig(),  # noqa: B008  (frozen)
@@ -164,18 +132,23 @@ def reconstruct(
         points: positions [m] and colours of sparse points; None starts from random ones.
         checkpoint: file that is written at every evaluation; if it exists the run goes on from it, with the same
             result as an unbroken one.
-        previews: folder for a picture of the first held-out view beside its photo every `config.preview_every` steps.
+        previews: folder for a picture of the first held-out (or else training) view beside its photo, every
+            `config.preview_every` steps.
         callback: told the progress every few dozen steps.
 
     Raises:
         InputError: no training views, too few points, or no masks where the settings need them.
     """
+    # the capacity of a picture would drop splats without a word
+    config = replace(config, render=replace(config.render, capacity=None, differentiation="reverse"))
     train = views.subset("train") if "train" in views.splits else views
     held_out = views.subset("test") if "test" in views.splits else None
     if points is None:
         points = random_points(train.cameras, min(config.splats, 5000), seed=config.seed)
     extent = float(np.linalg.norm(np.std(points[0], axis=0))) or 1.0
-    optimizers = _optimizer(config, extent), optax.adam(config.pose_rate)
+    pose_rate = optax.exponential_decay(config.pose_rate, config.steps, 0.1)
+    optimizers = _optimizer(config, extent), optax.adam(pose_rate)
+    bands = min(config.render.bands, -(-train.cameras.height // config.render.tile_size))
 
     def start(count: int) -> FitState:
         gaussians = start_gaussians(*points, count, config.sh_degree, seed=config.seed)
@@ -187,14 +160,18 @@ def reconstruct(
     if checkpoint is not None and checkpoint.exists():
         state = _resume(checkpoint, start, config)
     photos = _photos(train, config)
-    scored = None if held_out is None else (held_out, _photos(held_out, config))
-    result = Reconstruction(state.gaussians, {}, {}, train.cameras)
+    if photos.mattes is not None and not photos.mattes.any():
+        raise InputError(f"{_asked(config)}: no mask of the training views has any pixel of it.")
+    scored = None if held_out is None else _scored(held_out, config)
+    state, photos, cameras = replicate((state, photos, train.cameras), bands)
+    result = Reconstruction(state.gaussians, {}, {}, train.cameras, train.names)
     begun = time.perf_counter()
     while (step := int(state.step)) < config.steps:
         if (count := _count_at(step, config)) > len(state.gaussians):
             state = _grow(state, count, config)
         stop = min(config.steps, _next_stop(step, config))
-        state, loss = _train(state, train.cameras, photos, config, optimizers, extent, stop - step)
+        state, loss = _train(state, cameras, photos, config, optimizers, extent, jnp.asarray(stop - step))
+        state = replicate(state, bands)
         if config.relocate_every and stop % config.relocate_every == 0 and stop <= config.relocate_until * config.steps:
             state = _relocate(state, config)
         psnrs: dict[str, float] = {}
@@ -215,7 +192,7 @@ def reconstruct(
         gaussians=state.gaussians,
         psnr=psnrs,
         ssim=ssims,
-        cameras=train.cameras if state.poses is None else train.cameras.nudged(state.poses),
+        cameras=train.cameras if state.poses is None else train.cameras.nudged(_twist(state.poses, extent)),
         relocated=int(state.relocated),
     )
 
@@ -225,7 +202,7 @@ def _mean(scores: dict[str, float]) -> float | None:
 
 
 class _Photos(NamedTuple):
-    """Training images; with a matte they are black where it is 0."""
+    """Images of some views; with a matte they are black where it is 0."""
 
     images: Float[Array, "v h w 3"]
     mattes: Float[Array, "v h w 1"] | None
@@ -236,15 +213,34 @@ def _photos(views: io.Views, config: FitConfig) -> _Photos:
     if config.object_id is None and not config.random_background:
         return _Photos(images, None)
     if views.masks is None:
-        raise InputError(
-            "FitConfig.object_id and random_background need masks: load the views with load_views(..., masks=True)."
-        )
+        raise InputError(f"{_asked(config)} needs masks: load the views with load_views(..., masks=True).")
     masks = np.asarray(views.masks)
     matte = masks > 0 if config.object_id is None else masks == config.object_id
-    if not matte.any():
-        raise InputError(f"FitConfig.object_id = {config.object_id}: no mask of these views has that id.")
     mattes = jnp.asarray(matte[..., None], images.dtype)
     return _Photos(images * mattes, mattes)
+
+
+def _asked(config: FitConfig) -> str:
+    if config.object_id is None:
+        return "FitConfig.random_background"
+    return f"FitConfig.object_id = {config.object_id}"
+
+
+def _scored(views: io.Views, config: FitConfig) -> tuple[tuple[str, ...], Camera, Float[Array, "v h w 3"]] | None:
+    """Names, cameras and pictures to score by, without views in which the masks show nothing of what is fitted."""
+    photos = _photos(views, config)
+    if photos.mattes is None:
+        return views.names, views.cameras, photos.images
+    seen = np.nonzero(np.asarray(photos.mattes).any((1, 2, 3)))[0]
+    if not len(seen):
+        return None
+    images = photos.images + (1 - photos.mattes) * config.background
+    return tuple(views.names[k] for k in seen), views.cameras[seen], images[seen]
+
+
+def _twist(poses: Float[Array, "*v 6"], extent: float) -> Float[Array, "*v 6"]:
+    """Corrections as `Camera.nudged` takes them: shifts are learnt in units of the scene."""
+    return poses * jnp.asarray([1.0, 1.0, 1.0, extent, extent, extent])
 
 
 def _count_at(step: int, config: FitConfig) -> int:
@@ -332,11 +328,12 @@ def _loss(fitted, camera: Camera, photo: _Photos, background, config: FitConfig,
 
 
 @eqx.filter_jit
-def _train(state: FitState, cameras: Camera, photos: _Photos, config: FitConfig, optimizers, extent: float, count: int):
+def _train(state: FitState, cameras: Camera, photos: _Photos, config: FitConfig, optimizers, extent: float, count):
     """`count` steps: the state after them, and their mean loss."""
     views = photos.images.shape[0]
 
-    def one(state: FitState, _):
+    def one(_, carry):
+        state, total = carry
         key = jax.random.fold_in(jax.random.key(config.seed), state.step)
         # every view once per round, in a new order each round
         order = jax.random.permutation(jax.random.fold_in(jax.random.key(config.seed + 1), state.step // views), views)
@@ -347,7 +344,7 @@ def _train(state: FitState, cameras: Camera, photos: _Photos, config: FitConfig,
 
         def loss(fitted):
             gaussians, poses = fitted
-            twist = None if poses is None else poses[view]
+            twist = None if poses is None else _twist(poses[view], extent)
             photo = jax.tree.map(lambda array: array[view], photos)
             return _loss((gaussians, twist), cameras[view], photo, background, config, extent)
 
@@ -359,11 +356,18 @@ def _train(state: FitState, cameras: Camera, photos: _Photos, config: FitConfig,
             rate = config.means_rate * extent * 0.01 ** (state.step / config.steps)
             gaussians = shake(gaussians, key, config.noise * rate)
         pose_updates, pose_moments = optimizers[1].update(pose_gradient, state.pose_optimizer, state.poses)
-        poses = optax.apply_updates(state.poses, pose_updates)
-        return FitState(gaussians, moments, poses, pose_moments, state.step + 1, state.relocated), value
+        moved = (optax.apply_updates(state.poses, pose_updates), pose_moments)
+        visited = jnp.arange(views) == view
 
-    state, losses = lax.scan(one, state, length=count)
-    return state, jnp.mean(losses)
+        def only_visited(new, old):
+            # a camera that this step did not see must not move on by its momentum
+            return jnp.where(visited[:, None], new, old) if new.ndim == 2 else new
+
+        poses, pose_moments = jax.tree.map(only_visited, moved, (state.poses, state.pose_optimizer))
+        return FitState(gaussians, moments, poses, pose_moments, state.step + 1, state.relocated), total + value
+
+    state, total = lax.fori_loop(0, count, one, (state, jnp.zeros(())))
+    return state, total / count
 
 
 @eqx.filter_jit
@@ -382,15 +386,14 @@ def _relocate(state: FitState, config: FitConfig) -> FitState:
 
 
 def _score(
-    gaussians: Gaussians, held_out: tuple[io.Views, _Photos] | None, config: FitConfig
+    gaussians: Gaussians, held_out: tuple[tuple[str, ...], Camera, Array] | None, config: FitConfig
 ) -> tuple[dict[str, float], dict[str, float]]:
     """PSNR [dB] and SSIM of each held-out view by name."""
     if held_out is None:
         return {}, {}
-    views, photos = held_out
-    images = photos.images if photos.mattes is None else photos.images + (1 - photos.mattes) * config.background
-    psnrs, ssims = _score_views(gaussians, views.cameras, images, config)
-    return dict(zip(views.names, map(float, psnrs))), dict(zip(views.names, map(float, ssims)))
+    names, cameras, images = held_out
+    psnrs, ssims = _score_views(gaussians, cameras, images, config)
+    return dict(zip(names, map(float, psnrs))), dict(zip(names, map(float, ssims)))
 
 
 @eqx.filter_jit

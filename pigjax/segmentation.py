@@ -15,8 +15,9 @@ from scipy.spatial import cKDTree
 
 from pigjax.arrays import array_field
 from pigjax.camera import Camera, project
+from pigjax.chunks import static_capacity
 from pigjax.errors import InputError
-from pigjax.splat import Gaussians, RenderConfig, Splats, as_splats, render, required_capacity
+from pigjax.splat import Gaussians, RenderConfig, Splats, as_splats, blend_config, pairs_of, render, required_capacity
 from pigjax.tile_walks import credits_of_candidates, soft_surface_depth
 
 Scalar = Float[Array, ""] | float
@@ -102,6 +103,8 @@ def lift_masks(
     walks = enough_capacity(gaussians, cameras, config) if settled or temperature is not None else config
     drawn = config if temperature is None else walks
     votes, overflow = _collect(splats, cameras, masks, thresholds, num_ids, weighting, drawn)
+    if settled and (walks is config):
+        overflow += _left_out(splats, cameras, walks)
     rerun = jax.tree_util.Partial(_credit_candidates, splats, cameras, masks, walks)
     object_id, confidence = _elect(votes, background, min_votes, purity, rerun if settled else None)
     return Labels(object_id, votes, confidence, overflow)
@@ -214,9 +217,21 @@ def _collect(splats, cameras, masks, thresholds, num_ids, weighting, config):
     return lax.scan(one_view, start, (cameras, masks))[0]
 
 
+@eqx.filter_jit
+def _left_out(splats: Splats, cameras: Camera, config: RenderConfig):
+    """Pairs that the walk over tied Gaussians drops for want of capacity, over all views."""
+
+    def of_view(camera):
+        slots = static_capacity(len(splats), blend_config(camera, config, len(splats), surface=True))
+        return jnp.maximum(pairs_of(splats, camera, config) - slots, 0)
+
+    return jnp.sum(lax.map(of_view, cameras), dtype=jnp.int32)
+
+
 def _hard_votes(splats: Splats, camera: Camera, tau_T, tau_d, config: RenderConfig):
     """The pixel under each centre, whether the centre lies on the surface there, and the pairs dropped."""
-    depth, overflow = _draw("surface_depth", splats, camera, config, tau_T=tau_T)
+    reverse = dataclasses.replace(config, differentiation="reverse")  # nothing to differentiate, and never short
+    depth, overflow = _draw("surface_depth", splats, camera, reverse, tau_T=tau_T)
     pixel, z, inside = _pixel_under(splats, camera, config)
     depth = depth.ravel()[pixel]
     # where there is no surface the depth is NaN, and no comparison holds

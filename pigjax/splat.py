@@ -66,7 +66,7 @@ class RenderConfig(eqx.Module):
     """Every approximation of the renderer, static."""
 
     tile_size: int = static_field(default=16)  # [px]
-    capacity: int | None = static_field(default=None)  # box/tile pairs listed for an image; None: all that are seen
+    capacity: int | None = static_field(default=None)  # box/tile pairs listed per image; None: all, or see below
     slots: int | None = static_field(default=None)  # of them sorted at once; None: 2¹⁷ on a CPU, 2²¹ elsewhere, / bands
     sh_degree: int | None = static_field(default=None)  # None: all bands that the splats have
     alpha_min: float = static_field(default=1 / 255)  # fainter contributions are skipped
@@ -78,7 +78,15 @@ class RenderConfig(eqx.Module):
     chunk: int | None = static_field(default=None)  # splats blended between two looks at a tile; None: 64, or 16 if few
     tiles_at_once: int | None = static_field(default=None)  # walked together; None: 1 on a CPU, 2048 elsewhere
     bands: int = static_field(default=1)  # local devices that share the image, each a band of rows
-    differentiation: str = static_field(default="reverse")  # "forward" for jvp and hessians
+    # "forward" goes through any mode and order (jvp, hessian), but is slower, and its lists have a static capacity: 16
+    # pairs per splat unless given (`required_capacity` finds it); what does not fit is counted in Frame.overflow
+    differentiation: str = static_field(default="reverse")
+
+    def __check_init__(self):
+        if self.differentiation not in ("reverse", "forward"):
+            raise InputError(f"RenderConfig.differentiation = {self.differentiation!r}: choose reverse or forward.")
+        if self.bands < 1:
+            raise InputError(f"RenderConfig.bands = {self.bands}: one device or more must draw the image.")
 
 
 OUTPUTS = ("rgb", "alpha", "depth", "surface_depth", "object_weights", "normals", "features")
@@ -141,7 +149,8 @@ def render(
 
 @eqx.filter_jit
 def _render(gaussians_or_splats, camera, config, background, outputs, given, tau_T) -> Frame:
-    splats = as_splats(spread(gaussians_or_splats, config.bands))
+    bands = min(config.bands, -(-camera.height // config.tile_size))
+    splats = as_splats(spread(gaussians_or_splats, bands))
     if len(splats) == 0:
         # gathers need a row: one splat of opacity 0 draws nothing
         splats, given = jax.tree.map(lambda v: jnp.zeros((1, *v.shape[1:]), v.dtype), (splats, given))
@@ -156,7 +165,7 @@ def _render(gaussians_or_splats, camera, config, background, outputs, given, tau
         channels["normals"] = normals(splats, camera)
     channels |= given
     none = jnp.zeros((len(splats), 0), projected.depths.dtype)
-    projected, table = collect((projected, jnp.concatenate([none, *channels.values()], 1)), config.bands)
+    projected, table = collect((projected, jnp.concatenate([none, *channels.values()], 1)), bands)
     reverse = config.differentiation == "reverse"
     alpha, image, surface, overflow = blend(projected, table, blending, tau_T, reverse=reverse)
 
@@ -195,12 +204,14 @@ def required_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: Re
 
 @eqx.filter_jit
 def _most_pairs(splats: Splats, cameras: Camera, config: RenderConfig) -> Int[Array, ""]:
-    def pairs(camera: Camera) -> Int[Array, ""]:
-        blending = blend_config(camera, config, len(splats), surface=False)
-        _, box = tile_boxes(project_splats(splats, camera, config), blending)
-        return count_pairs(box[:, 0] * box[:, 1])
+    return jnp.max(lax.map(lambda camera: pairs_of(splats, camera, config), cameras))
 
-    return jnp.max(lax.map(pairs, cameras))
+
+def pairs_of(splats: Splats, camera: Camera, config: RenderConfig) -> Int[Array, ""]:
+    """Box/tile pairs of all splats in one view."""
+    blending = blend_config(camera, config, len(splats), surface=False)
+    _, box = tile_boxes(project_splats(splats, camera, config), blending)
+    return count_pairs(box[:, 0] * box[:, 1])
 
 
 def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: bool) -> BlendConfig:
@@ -217,7 +228,7 @@ def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: b
         slots=slots_of(count, tiles, config.capacity, limit),
         capacity=config.capacity,
         tiles_at_once=config.tiles_at_once or (1 if on_cpu else 2048),
-        bands=config.bands,
+        bands=min(config.bands, -(-camera.height // config.tile_size)),
         alpha_min=config.alpha_min,
         alpha_max=config.alpha_max,
         transmittance_min=config.transmittance_min,

@@ -22,6 +22,8 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from pigjax.bands import in_bands
+from pigjax.chunks import all_chunks, walk
+from pigjax.footprints import TERMS, as_tiles_see, blend_chunk, crossing, monomials, product, tile_alphas
 from pigjax.lists import (
     SHAPE_COLUMNS,
     BlendConfig,
@@ -32,12 +34,6 @@ from pigjax.lists import (
     list_pass,
     pairs_in_open_tiles,
 )
-
-_TERMS = 6  # of a polynomial of degree two in the plane
-_NOWHERE = np.array([-1e4, 0, 0, 0, 0, 0])  # polynomial of a splat whose alpha is 0
-
-# accelerators round float32 factors to TF32 unless told otherwise
-_product = functools.partial(jnp.matmul, precision=lax.Precision.HIGHEST)
 
 
 class Blended(NamedTuple):
@@ -64,63 +60,20 @@ def blend(
         features: what is summed with weight alpha·T, any number of channels.
         config: image size, thresholds and static sizes.
         tau: transmittance below which a pixel's surface lies; its derivative is zero.
-        reverse: use the hand-written backward pass; False leaves a loop that forward mode can differentiate.
+        reverse: use the hand-written backward pass; False blends by a plain scan over lists of a static capacity, which
+            every mode and order of differentiation goes through.
     """
     boxes = front_to_back(lax.stop_gradient(projected), config)
     extra = [projected.depths[:, None]] if config.surface else []
     ones = jnp.ones_like(projected.depths)[:, None]
     table = jnp.concatenate([projected.shapes, features, ones, *extra], 1)[boxes.order]
     tau = lax.stop_gradient(jnp.asarray(tau, table.dtype))
-    composite = _composite if reverse else _forward
+    composite = _composite if reverse else _by_scan
     planes, overflow = (composite if config.bands == 1 else in_bands(composite))(table, boxes, tau, config)
     image = planes.reshape(-1, config.columns, planes.shape[1], config.tile, config.tile).transpose(0, 3, 1, 4, 2)
     image = image.reshape(-1, config.columns * config.tile, planes.shape[1])
     image, channels = image[: config.height, : config.width], features.shape[1]
     return Blended(image[..., channels], image[..., :channels], image[..., -1] if config.surface else None, overflow)
-
-
-def as_tiles_see(rows: Float[Array, "s k"], tile: Int[Array, "s"], config: BlendConfig) -> Float[Array, "s k"]:
-    """Rows for `tile_alphas`: the exponent of each Gaussian as a polynomial about the centre of a tile.
-
-    Columns: coefficients of 1, x, y, xx, xy, yy; then the features.
-    """
-    x, y, a, b, c, peak = rows[:, :SHAPE_COLUMNS].T
-    half = config.tile / 2
-    dx = (tile % config.columns * config.tile).astype(rows.dtype) + half - x
-    dy = (tile // config.columns * config.tile).astype(rows.dtype) + half - y
-    at_centre = peak - (0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy)
-    polynomial = jnp.stack([at_centre, -(a * dx + b * dy), -(b * dx + c * dy), -0.5 * a, -b, -0.5 * c], 1)
-    return jnp.concatenate([polynomial, rows[:, SHAPE_COLUMNS:]], 1)
-
-
-def tile_alphas(rows, valid, config: BlendConfig):
-    """Alpha [chunk pixels] of each splat at each pixel of a tile, and its value before the alpha_max clamp."""
-    # a product, since XLA would read the list anew for every pixel of a sum
-    polynomial = jnp.where(valid[:, None], rows[:, :_TERMS], jnp.asarray(_NOWHERE, rows.dtype))
-    exponent = _product(polynomial, _monomials(config, rows.dtype))
-    unclamped = jnp.exp(exponent)
-    alpha = jnp.minimum(unclamped, config.alpha_max)
-    return jnp.where(alpha >= config.alpha_min, alpha, 0.0), unclamped
-
-
-def _monomials(config: BlendConfig, dtype):
-    """1, x, y, xx, xy, yy [6 pixels] of the pixel centres about the centre of a tile."""
-    along = np.arange(config.tile) + 0.5 - config.tile / 2
-    x, y = np.tile(along, config.tile), np.repeat(along, config.tile)
-    return jnp.asarray(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]), dtype)
-
-
-def _blend_chunk(alpha, through, config: BlendConfig):
-    """Transmittance before each splat of a chunk and behind all of them, and the weights alpha·T."""
-    behind, before = lax.scan(lambda t, a: (t * (1 - a), t), through, alpha)
-    weight = alpha * before
-    return before, jnp.where(before - weight > config.transmittance_min, weight, 0.0), behind
-
-
-def _crossing(before, alpha, tau, config: BlendConfig):
-    # the splat that closes a pixel is not blended, yet it may be the surface
-    open_ = before > config.transmittance_min
-    return open_ & (before >= tau) & (before * (1 - alpha) < tau)
 
 
 def _passes(table, boxes: Boxes, config: BlendConfig, state, visit):
@@ -205,14 +158,14 @@ def _forward(table, boxes: Boxes, tau, config: BlendConfig):
     pixels, dtype, groups = config.tile**2, table.dtype, _groups(config)
     channels = table.shape[1] - SHAPE_COLUMNS
 
-    def blend_chunk(rows, valid, through, planes):
+    def one_tile(rows, valid, through, planes):
         alpha, _ = tile_alphas(rows, valid, config)
-        before, weight, behind = _blend_chunk(alpha, through, config)
-        values = rows[:, _TERMS:].T
+        before, weight, behind = blend_chunk(alpha, through, config)
+        values = rows[:, TERMS:].T
         if not config.surface:
-            return behind, planes + _product(values, weight)
-        picked = _product(values[-1:], _crossing(before, alpha, tau, config).astype(dtype))
-        return behind, planes + jnp.concatenate([_product(values[:-1], weight), picked])
+            return behind, planes + product(values, weight)
+        picked = product(values[-1:], crossing(before, alpha, tau, config).astype(dtype))
+        return behind, planes + jnp.concatenate([product(values[:-1], weight), picked])
 
     def visit(lists, state):
         rows = _in_list_order(table, lists, config)
@@ -221,7 +174,7 @@ def _forward(table, boxes: Boxes, tau, config: BlendConfig):
             tiles, *state = group
 
             def visit_chunk(chunk, _, valid, state):
-                return jax.vmap(blend_chunk)(chunk, valid, *state)
+                return jax.vmap(one_tile)(chunk, valid, *state)
 
             return _walk(rows, lists, tiles, tuple(state), visit_chunk, config)
 
@@ -231,6 +184,22 @@ def _forward(table, boxes: Boxes, tau, config: BlendConfig):
     start = jnp.ones((config.tiles, pixels), dtype), jnp.zeros((config.tiles, channels, pixels), dtype)
     (_, planes), overflow = _passes(table, boxes, config, start, visit)
     return planes, overflow
+
+
+def _by_scan(table, boxes: Boxes, tau, config: BlendConfig):
+    """As `_forward`, without a loop whose length depends on the data."""
+    chunks, overflow = all_chunks(table, boxes, config)
+
+    def visit(chunk, alpha, before, after):
+        weight = jnp.where(after > config.transmittance_min, alpha * before, 0.0)
+        values = chunk.rows[:, TERMS:].T
+        if not config.surface:
+            return product(values, weight)
+        picked = product(values[-1:], crossing(before, alpha, tau, config).astype(table.dtype))
+        return jnp.concatenate([product(values[:-1], weight), picked])
+
+    parts = walk(chunks, jnp.any(chunks.valid, 1), config, visit)
+    return jax.ops.segment_sum(parts, chunks.tile, config.tiles), overflow
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
@@ -249,11 +218,11 @@ def _composite_bwd(config: BlendConfig, saved, cotangents):
     pixels, dtype, groups = config.tile**2, table.dtype, _groups(config)
     blended = table.shape[1] - SHAPE_COLUMNS - config.surface  # the surface is picked, not blended
     totals = jnp.sum((planes * cotangent)[:, :blended], axis=1)
-    monomials = _monomials(config, dtype)
+    pixel_terms = monomials(config, dtype)
 
     def walk_chunk(rows, valid, through, prefix, total, towards):
         alpha, unclamped = tile_alphas(rows, valid, config)
-        gain = _product(rows[:, _TERMS : _TERMS + blended], towards[:blended])
+        gain = product(rows[:, TERMS : TERMS + blended], towards[:blended])
 
         def one(carry, splat):
             before, prefix = carry
@@ -267,9 +236,9 @@ def _composite_bwd(config: BlendConfig, saved, cotangents):
         slope = weight * gain - (total - prefix) * (alpha / (1 - alpha))
         slope = jnp.where((weight > 0) & (unclamped < config.alpha_max), slope, 0.0)
         # the exponent is linear in its coefficients, so their gradients are moments of the pixel grid
-        columns = [_product(slope, monomials.T), _product(weight, towards[:blended].T)]
+        columns = [product(slope, pixel_terms.T), product(weight, towards[:blended].T)]
         if config.surface:
-            columns.append(_product(_crossing(before, alpha, tau, config).astype(dtype), towards[blended:].T))
+            columns.append(product(crossing(before, alpha, tau, config).astype(dtype), towards[blended:].T))
         return behind, end, jnp.concatenate(columns, 1)
 
     def visit(lists, state):

@@ -13,10 +13,11 @@ PACKAGE = Path(__file__).parents[1] / "pigjax"
 FLOORS = [
     {"errors", "arrays"},
     {"linalg", "metrics", "lists"},
-    {"camera", "materials", "bands"},
+    {"camera", "materials", "bands", "footprints"},
+    {"chunks"},
     {"tiles", "colliders", "transfers"},
     {"splat", "matter"},
-    {"tile_walks", "clamp", "shells", "relocation", "overlay", "mls_mpm", "io"},
+    {"tile_walks", "clamp", "shells", "relocation", "starts", "overlay", "mls_mpm", "io"},
     {"filling"},
     {"segmentation", "particles", "solids", "reconstruct", "pruning"},
     {"scene"},
@@ -24,8 +25,8 @@ FLOORS = [
 ]
 FLOOR_OF = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
 # the two worlds meet in particles.py and solids.py only
-SPLATS = {"splat", "lists", "bands", "tiles", "tile_walks", "clamp", "segmentation", "relocation", "reconstruct"}
-SPLATS |= {"filling", "shells", "pruning"}
+SPLATS = {"splat", "lists", "footprints", "chunks", "bands", "tiles", "tile_walks", "clamp", "segmentation"}
+SPLATS |= {"starts", "relocation", "reconstruct", "filling", "shells", "pruning"}
 MATTER = {"matter", "mls_mpm", "transfers", "materials", "colliders"}
 
 

@@ -223,7 +223,9 @@ def test_forward_mode_and_hessian_agree_with_reverse_mode(x64):
 
     reverse = jax.grad(loss)(gaussians.means, "reverse")
     np.testing.assert_allclose(jax.jacfwd(loss)(gaussians.means, "forward"), reverse, rtol=1e-9, atol=1e-12)
-    hessian = jax.jacfwd(jax.jacfwd(loss))(gaussians.means, "forward").reshape(18, 18)
+    hessian = jax.hessian(loss)(gaussians.means, "forward").reshape(18, 18)
+    tangent = jax.jvp(lambda means: loss(means, "forward"), (gaussians.means,), (jnp.ones((6, 3)),))[1]
+    np.testing.assert_allclose(tangent, reverse.sum(), rtol=1e-9)
     np.testing.assert_allclose(hessian, hessian.T, atol=1e-9)
     direction = np.random.default_rng(0).normal(size=(6, 3))
     h = 1e-6
@@ -499,8 +501,20 @@ def test_two_devices_draw_what_one_draws():
     np.testing.assert_allclose(two.rgb, one.rgb, atol=1e-6)
     for ours, other in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected)):
         np.testing.assert_allclose(ours, other, atol=2e-5 * np.abs(other).max())
-    with pytest.raises(InputError, match=r"bands = 64: JAX has 2 local devices.*jax_num_cpu_devices"):
+    with pytest.raises(InputError, match=r"bands = 4: JAX has 2 local devices.*jax_num_cpu_devices"):
         render(gaussians, camera, RenderConfig(bands=64))
+
+
+@pytest.mark.parametrize("outputs", [("rgb", "alpha"), ("surface_depth", "depth")])
+def test_both_ways_of_blending_draw_the_same(outputs):
+    scene, camera = make_scene(count=150)
+    gaussians = gaussians_of(scene)
+    loops = render(gaussians, camera, outputs=outputs)
+    scan = render(gaussians, camera, RenderConfig(differentiation="forward", chunk=16), outputs=outputs)
+    for name in outputs:
+        np.testing.assert_allclose(getattr(scan, name), getattr(loops, name), atol=2e-6)
+    short = render(gaussians, camera, RenderConfig(differentiation="forward", capacity=100), outputs=outputs)
+    assert short.overflow > 0
 
 
 def test_vmap_over_cameras_and_over_splats_equals_one_by_one():

@@ -17,7 +17,8 @@ def load_gaussians(path: PathLike, *, drop_invalid: bool = False) -> Gaussians:
     """Gaussians from `.ply` (INRIA's layout or PlayCanvas' compressed one), `.splat` or `.spz`. Host.
 
     Compressed `.ply` and `.spz` are decoded by the package gsply: `pip install 'pigjax[formats]'`. These formats and
-    `.splat` store rounded numbers, and `.splat` no view-dependent colour.
+    `.splat` store rounded numbers, and `.splat` no view-dependent colour. Axes are taken as the file has them: some
+    writers of `.spz` turn y and z.
 
     Raises:
         MissingFileError: there is no such file.

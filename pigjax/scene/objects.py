@@ -77,10 +77,10 @@ def describe_file(path: Path) -> dict[str, str]:
     """
     if not path.exists():
         raise MissingFileError(f"{path}: does not exist; check the path.")
-    if path.suffix == ".ply":
+    if path.suffix.lower() == ".ply":
         return _describe_gaussians(io.read_ply(path, drop_invalid=True))
-    if path.suffix in (".splat", ".spz"):
-        return _describe_gaussians((io.load_gaussians(path), 0))
+    if path.suffix.lower() in (".splat", ".spz"):
+        return _describe_gaussians((io.load_gaussians(path, drop_invalid=True), 0))
     if path.suffix == ".toml":
         scene = load_scene(path)
         moving = {name: entry.material or entry.model for name, entry in scene.objects.items() if not entry.fixed}
