@@ -101,3 +101,17 @@ def test_a_plain_ply_needs_no_gsply(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "gsply", None)
     save_ply(tmp_path / "a.ply", random_gaussians(count=3))
     np.testing.assert_array_equal(load_gaussians(tmp_path / "a.ply").means, load_ply(tmp_path / "a.ply").means)
+
+
+def test_the_command_line_says_what_to_install_and_leaves_with_2(tmp_path, monkeypatch, capsys):
+    from pigjax import cli
+
+    (tmp_path / "a.spz").write_bytes(b"junk" * 20)
+    monkeypatch.setitem(sys.modules, "gsply", None)
+    monkeypatch.setattr(cli, "_one_device_per_core", lambda: None)
+    monkeypatch.setattr(sys, "argv", ["pigjax", "info", str(tmp_path / "a.spz")])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 2
+    # brackets are no markup
+    assert "pip install 'pigjax[formats]'" in capsys.readouterr().err.replace("\n", "")

@@ -258,3 +258,38 @@ def test_every_kind_of_capture_gives_the_same_reconstruction(tmp_path, write):
     print(f"{write.__name__}: {ours.mean_psnr:.2f} dB, nerfstudio {expected.mean_psnr:.2f} dB")
     assert expected.mean_psnr > 16
     assert abs(ours.mean_psnr - expected.mean_psnr) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"start_splats": 2}, "start_splats = 2, grow_every = 500: start with 4"),
+        (
+            {"start_splats": 100, "splats": 15_000},
+            r"doubles to 3200 of splats = 15000 within 3000 steps: lower grow_every",
+        ),
+    ],
+)
+def test_growth_that_cannot_reach_its_end_is_a_clear_error(change, message):
+    with pytest.raises(InputError, match=message):
+        FitConfig(**change)
+
+
+def test_steps_of_any_number_compile_once(views):
+    """Previews cut the run into uneven pieces; each piece is the same program."""
+    loaded, points = views
+    module = sys.modules["pigjax.reconstruct"]
+    traces = []
+    original = module._loss
+
+    def counted(*arguments):
+        traces.append(1)
+        return original(*arguments)
+
+    module._loss = counted
+    try:
+        config = replace(CONFIG, steps=60, preview_every=7, seed=3)
+        reconstruct(loaded, config, points=points)
+    finally:
+        module._loss = original
+    assert len(traces) == 1
