@@ -34,7 +34,6 @@ Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results."
 
 def main() -> None:
     """Entry point: errors of the input become one line and exit code 2, of the simulation exit code 3."""
-    _one_device_per_core()
     try:
         app()
     except (InputError, SimulationError) as error:
@@ -138,6 +137,7 @@ def reconstruct(
     seed: int = 0,
 ) -> None:
     """Fit Gaussians to photos; writes OUT/gaussians.ply, and goes on from OUT/checkpoint if it was stopped."""
+    _one_device_per_core()
     import jax
 
     from pigjax import io

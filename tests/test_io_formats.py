@@ -108,7 +108,6 @@ def test_the_command_line_says_what_to_install_and_leaves_with_2(tmp_path, monke
 
     (tmp_path / "a.spz").write_bytes(b"junk" * 20)
     monkeypatch.setitem(sys.modules, "gsply", None)
-    monkeypatch.setattr(cli, "_one_device_per_core", lambda: None)
     monkeypatch.setattr(sys, "argv", ["pigjax", "info", str(tmp_path / "a.spz")])
     with pytest.raises(SystemExit) as stop:
         cli.main()
