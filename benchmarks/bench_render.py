@@ -36,10 +36,9 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from _timing import machine, measure  # noqa: E402
 from jax import lax  # noqa: E402
-from jax.sharding import NamedSharding, PartitionSpec  # noqa: E402
 
 from pigjax import Gaussians, RenderConfig, look_at, render, stack_cameras  # noqa: E402
-from pigjax.bands import band_mesh  # noqa: E402
+from pigjax.bands import replicate  # noqa: E402
 from pigjax.lists import front_to_back, list_pass  # noqa: E402
 from pigjax.splat import as_splats, blend_config, colours, project_splats  # noqa: E402
 from pigjax.tiles import blend  # noqa: E402
@@ -78,13 +77,9 @@ def size_of(text):
     return int(count), int(width), int(height)
 
 
-def placed(tree, bands):
-    return tree if bands == 1 else jax.device_put(tree, NamedSharding(band_mesh(bands), PartitionSpec()))
-
-
 def row(text, bands):
     count, width, height = size_of(text)
-    scene = placed(ball(count, width, height), bands)
+    scene = replicate(ball(count, width, height), bands)
     config = RenderConfig(bands=bands)
     compile_forward, forward, frame = measure(lambda g, c: render(g, c, config), *scene)
     line = f"{count:>8} {width}x{height}  bands {bands}  fwd {forward * 1e3:8.1f} ms (compile {compile_forward:.1f} s)"
@@ -153,10 +148,10 @@ def growth(bands):
     """Time against splats, pixels and views."""
     config, series = RenderConfig(bands=bands), {}
     for count in (1_000, 10_000, 100_000, 1_000_000):
-        scene = placed(ball(count, 512, 512), bands)
+        scene = replicate(ball(count, 512, 512), bands)
         series.setdefault("splats at 512²", []).append((count, time_both(scene, config)))
     for width, height in ((128, 128), (256, 256), (512, 512), (1024, 1024), (1920, 1080)):
-        scene = placed(ball(100_000, width, height), bands)
+        scene = replicate(ball(100_000, width, height), bands)
         series.setdefault("pixels, 100k splats", []).append((width * height, time_both(scene, config)))
     gaussians, camera = ball(10_000, 256, 256)
     for views in (1, 4, 16):
@@ -165,7 +160,7 @@ def growth(bands):
         batched = jax.vmap(lambda g, c: render(g, c).rgb, (None, 0))
         times = [measure(f, gaussians, cameras, repeats=5)[1] for f in (one_by_one, batched)]
         print(f"    {views:3} views of 10k / 256²: lax.map {times[0] * 1e3:.1f} ms, vmap {times[1] * 1e3:.1f} ms")
-    scene = placed(ball(1_000_000, 1920, 1080), bands)
+    scene = replicate(ball(1_000_000, 1920, 1080), bands)
     series["1M / 1080p"] = [(1_000_000, time_both(scene, config))]
     for name, points in series.items():
         for x, (forward, both) in points:

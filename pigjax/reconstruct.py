@@ -23,7 +23,7 @@ from pigjax.camera import Camera
 from pigjax.errors import InputError
 from pigjax.metrics import psnr, ssim
 from pigjax.relocation import relocate, shake
-from pigjax.splat import Gaussians, RenderConfig, render
+from pigjax.splat import Gaussians, RenderConfig, bands_of, render
 from pigjax.starts import random_points, start_gaussians
 
 
@@ -148,7 +148,7 @@ def reconstruct(
     extent = float(np.linalg.norm(np.std(points[0], axis=0))) or 1.0
     pose_rate = optax.exponential_decay(config.pose_rate, config.steps, 0.1)
     optimizers = _optimizer(config, extent), optax.adam(pose_rate)
-    bands = min(config.render.bands, -(-train.cameras.height // config.render.tile_size))
+    bands = bands_of(train.cameras, config.render)
 
     def start(count: int) -> FitState:
         gaussians = start_gaussians(*points, count, config.sh_degree, seed=config.seed)

@@ -149,7 +149,7 @@ def render(
 
 @eqx.filter_jit
 def _render(gaussians_or_splats, camera, config, background, outputs, given, tau_T) -> Frame:
-    bands = min(config.bands, -(-camera.height // config.tile_size))
+    bands = bands_of(camera, config)
     splats = as_splats(spread(gaussians_or_splats, bands))
     if len(splats) == 0:
         # gathers need a row: one splat of opacity 0 draws nothing
@@ -214,6 +214,11 @@ def pairs_of(splats: Splats, camera: Camera, config: RenderConfig) -> Int[Array,
     return count_pairs(box[:, 0] * box[:, 1])
 
 
+def bands_of(camera: Camera, config: RenderConfig) -> int:
+    """Devices that share an image: no more than it has rows of tiles."""
+    return min(config.bands, -(-camera.height // config.tile_size))
+
+
 def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: bool) -> BlendConfig:
     """What listing and blending need of the camera, the number of splats and the settings."""
     on_cpu = jax.default_backend() == "cpu"
@@ -228,7 +233,7 @@ def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: b
         slots=slots_of(count, tiles, config.capacity, limit),
         capacity=config.capacity,
         tiles_at_once=config.tiles_at_once or (1 if on_cpu else 2048),
-        bands=min(config.bands, -(-camera.height // config.tile_size)),
+        bands=bands_of(camera, config),
         alpha_min=config.alpha_min,
         alpha_max=config.alpha_max,
         transmittance_min=config.transmittance_min,
