@@ -9,7 +9,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pigjax.materials.tensors import Scalars
+from pigjax.materials.tensors import Scalars, length
 
 Strains = Float[Array, "3 *n"]
 
@@ -20,18 +20,14 @@ def von_mises(strain: Strains, hardening: Scalars, m) -> tuple[Strains, Scalars]
     σ_y(α) = max(yield_stress + hardening_modulus α, residual_stress), with α the equivalent plastic strain; a negative
     modulus softens.
     """
-    mean = strain.mean(0)
-    deviatoric = strain - mean
-    norm = _norm(deviatoric)
-    stress = 2 * m.mu * norm
+    stress = 2 * m.mu * length(strain - strain.mean(0))
     root = (2 / 3) ** 0.5
     hardened = (stress - root * (m.yield_stress + m.hardening_modulus * hardening)) / (
         2 * m.mu + 2 / 3 * m.hardening_modulus
     )
     softened = (stress - root * m.residual_stress) / (2 * m.mu)
     flow = jnp.maximum(jnp.minimum(hardened, softened), 0.0)
-    kept = 1 - flow / jnp.where(norm > 0, norm, 1.0)
-    return mean + deviatoric * kept, hardening + root * flow
+    return shortened(strain, flow), hardening + root * flow
 
 
 def drucker_prager(strain: Strains, hardening: Scalars, m) -> tuple[Strains, Scalars]:
@@ -47,7 +43,7 @@ def drucker_prager(strain: Strains, hardening: Scalars, m) -> tuple[Strains, Sca
     tip = 3 * m.cohesion / jnp.tan(m.friction_angle) / bulk
     volumetric = strain.sum(0) + hardening
     deviatoric = strain - strain.mean(0)
-    norm = _norm(deviatoric)
+    norm = length(deviatoric)
     flow = jnp.clip(norm + slope * bulk / (2 * m.mu) * (volumetric - tip), 0.0, norm)
     kept = 1 - flow / jnp.where(norm > 0, norm, 1.0)
     loose = volumetric > tip
@@ -55,7 +51,9 @@ def drucker_prager(strain: Strains, hardening: Scalars, m) -> tuple[Strains, Sca
     return returned, jnp.where(loose, volumetric - tip, 0.0)
 
 
-def _norm(vector: Strains) -> Scalars:
-    squared = (vector * vector).sum(0)
-    positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+def shortened(strain: Strains, flow: Scalars) -> Strains:
+    """Strains whose deviator is shorter by `flow`, which is no longer than it."""
+    mean = strain.mean(0)
+    deviatoric = strain - mean
+    norm = length(deviatoric)
+    return mean + deviatoric * (1 - flow / jnp.where(norm > 0, norm, 1.0))

@@ -42,6 +42,13 @@ def deviator(a: Tensors) -> Tensors:
     return a - trace(a) / 3 * identity(a)
 
 
+def length(vector: Float[Array, "3 *n"]) -> Scalars:
+    """Euclidean norm; its derivative at zero is zero."""
+    squared = (vector * vector).sum(0)
+    positive = squared > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+
+
 def spectral(axes: Tensors, values: Float[Array, "3 *n"], other: Tensors | None = None) -> Tensors:
     """axes @ diag(values) @ otherᵀ, with `other` the axes themselves unless given."""
     return product(axes * values, transpose(axes if other is None else other))
