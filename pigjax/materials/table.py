@@ -24,7 +24,7 @@ def _number(**kwargs):
 
 
 class Parameters(eqx.Module):
-    """The numbers of materials in SI units; zero where a law has no use for one."""
+    """The numbers of materials in SI units. A law ignores those that it has no use for."""
 
     density: Float[Array, "*m"] = _number()  # at rest [kg/m³]
     young: Float[Array, "*m"] = _number(default=0.0)  # Young's modulus [Pa]
@@ -35,7 +35,14 @@ class Parameters(eqx.Module):
     friction_angle: Float[Array, "*m"] = _number(default=0.0)  # [rad]
     cohesion: Float[Array, "*m"] = _number(default=0.0)  # [Pa]
     bulk_modulus: Float[Array, "*m"] = _number(default=0.0)  # of a fluid; 0: from young and poisson [Pa]
-    viscosity: Float[Array, "*m"] = _number(default=0.0)  # dynamic [Pa s]
+    viscosity: Float[Array, "*m"] = _number(default=0.0)  # dynamic [Pa s]; of a foam [Pa sʰ] with its exponent h
+    flow_exponent: Float[Array, "*m"] = _number(default=1.0)  # h of Herschel and Bulkley; 1 is Bingham's, < 1 thins
+    hardening_coefficient: Float[Array, "*m"] = _number(default=10.0)  # ξ of snow
+    critical_compression: Float[Array, "*m"] = _number(default=2.5e-2)  # strain at which snow is packed
+    critical_stretch: Float[Array, "*m"] = _number(default=7.5e-3)  # strain at which snow breaks
+    fibre_stiffness: Float[Array, "*m"] = _number(default=0.0)  # Young's modulus that fibres add along them [Pa]
+    fibre_azimuth: Float[Array, "*m"] = _number(default=0.0)  # of fibres at rest, about z from x [rad]
+    fibre_elevation: Float[Array, "*m"] = _number(default=0.0)  # of fibres at rest, above the plane of x and y [rad]
 
     @property
     def mu(self) -> Float[Array, "*m"]:
@@ -72,12 +79,10 @@ class Material(Parameters):
             given = name in needed or np.any(value != 0)
             if given and not np.all(np.isfinite(value) & holds(value)):
                 raise InputError(f"{name} = {value}: {limit} in a material of model {self.model!r}.")
-        stiffness = self.mu + self.hardening_modulus / 3
-        if "yield_stress" in needed and not isinstance(stiffness, jax.core.Tracer) and not np.all(stiffness > 0):
-            raise InputError(
-                f"hardening_modulus = {self.hardening_modulus}: softening must stay above -3 times the shear modulus,"
-                f" {-3 * self.mu} Pa."
-            )
+        for name, models, limit, holds in _JOINT_LIMITS:
+            held = holds(self) if self.model in models else True
+            if not isinstance(held, jax.core.Tracer) and not np.all(held):
+                raise InputError(f"{name} = {getattr(self, name)}: {limit} in a material of model {self.model!r}.")
 
 
 _LIMITS = {
@@ -94,7 +99,39 @@ _LIMITS = {
     "cohesion": ("the cohesion must be >= 0 Pa", lambda v: v >= 0),
     "bulk": ("the bulk modulus must be > 0 Pa (or give young and poisson)", lambda v: v > 0),
     "viscosity": ("the viscosity must be >= 0 Pa s", lambda v: v >= 0),
+    "flow_exponent": ("the flow exponent must be between 0.1 and 10", lambda v: (v >= 0.1) & (v <= 10)),
+    "hardening_coefficient": ("the hardening coefficient must be >= 0", lambda v: v >= 0),
+    "critical_compression": (
+        "the critical compression must be between 0 and 1, both excluded",
+        lambda v: (v > 0) & (v < 1),
+    ),
+    "critical_stretch": ("the critical stretch must be > 0", lambda v: v > 0),
+    "fibre_stiffness": ("the stiffness of fibres must be > 0 Pa", lambda v: v > 0),
+    "fibre_azimuth": ("the azimuth of fibres must be an angle in rad", lambda v: v == v),
+    "fibre_elevation": ("the elevation of fibres must be an angle in rad", lambda v: v == v),
 }
+# Laws, and what must hold between the numbers of one material.
+_JOINT_LIMITS = (
+    (
+        "hardening_modulus",
+        ("von_mises",),
+        "softening must stay above -3 times the shear modulus E/2(1+ν)",
+        lambda m: m.hardening_modulus > -3 * m.mu,
+    ),
+    (
+        "hardening_modulus",
+        ("plasticine",),
+        "it must be <= 0 Pa, since damage grows",
+        lambda m: m.hardening_modulus <= 0,
+    ),
+    (
+        "residual_stress",
+        ("von_mises", "plasticine"),
+        "it must not be above the yield stress",
+        lambda m: m.residual_stress <= m.yield_stress,
+    ),
+    ("viscosity", ("foam",), "it must be > 0 Pa sʰ", lambda m: m.viscosity > 0),
+)
 
 
 class MaterialTable(Parameters):
@@ -111,11 +148,24 @@ class MaterialTable(Parameters):
 
     @property
     def wave_speed(self) -> Float[Array, "m"]:
-        """Speed of pressure waves at rest [m/s]: √((λ + 2μ)/ρ), in a fluid √(K/ρ); 0 where matter never moves."""
-        fluid = np.array([law == "fluid" for law in self.laws])
-        moves = np.array([law_of(law).respond is not None for law in self.laws])
-        modulus = jnp.where(fluid, self.bulk, self.lam + 2 * self.mu)
-        return jnp.sqrt(jnp.where(moves, modulus, 0.0) / self.density)
+        """Speed of pressure waves [m/s] at small stretches, √(M/ρ); 0 where matter never moves.
+
+        The modulus M is λ + 2μ, along fibres with their stiffness, in snow as packed as can be; in a fluid K.
+        """
+        modulus = sum(self._of(law, law_of(law).modulus(self)) for law in dict.fromkeys(self.laws))
+        return jnp.sqrt(modulus / self.density)
+
+    @property
+    def explicit_viscosity(self) -> Float[Array, "m"]:
+        """Viscosity [Pa s] of the laws whose viscous stress limits an explicit step; 0 in the others.
+
+        Foam is not among them: its flow is implicit in each particle.
+        """
+        return self._of("fluid", self.viscosity)
+
+    def _of(self, law: str, values: Float[Array, "m"]) -> Float[Array, "m"]:
+        """Values in the rows of a law, 0 in the others."""
+        return jnp.where(np.array([other == law for other in self.laws]), values, 0.0)
 
 
 def material_table(materials: Sequence[Material]) -> MaterialTable:
