@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,13 +13,10 @@ import msgspec
 from msgspec import Struct
 
 from pigjax.errors import InputError, MissingFileError, SceneError
-from pigjax.materials import PRESETS, Material
+from pigjax.materials import PRESETS, Material, Parameters
 
 Triple = tuple[float, float, float]
-_NUMBERS = (
-    "density", "young", "poisson", "yield_stress", "hardening_modulus", "residual_stress", "friction_angle", "cohesion",
-    "bulk_modulus", "viscosity",
-)  # fmt: skip
+_NUMBERS = tuple(field.name for field in fields(Parameters))
 
 
 class InputSpec(Struct, forbid_unknown_fields=True, frozen=True):
@@ -101,6 +99,13 @@ class ObjectSpec(Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
     cohesion: float | None = None
     bulk_modulus: float | None = None
     viscosity: float | None = None
+    flow_exponent: float | None = None
+    hardening_coefficient: float | None = None
+    critical_compression: float | None = None
+    critical_stretch: float | None = None
+    fibre_stiffness: float | None = None
+    fibre_azimuth: float | None = None  # [rad]
+    fibre_elevation: float | None = None
 
     def to_material(self, name: str) -> Material:
         """The material that it says.
