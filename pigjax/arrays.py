@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -27,3 +28,29 @@ def array_field(**kwargs: Any) -> Any:
 def static_field(**kwargs: Any) -> Any:
     """Field that sizes a shape or picks a branch; a new value compiles anew."""
     return eqx.field(static=True, **kwargs)
+
+
+@jax.custom_batching.custom_vmap
+def everywhere(condition: Any) -> Any:
+    """The condition itself; inside vmap, whether it holds in every member of the batch.
+
+    The result has no batch axis, so that a loop or a conditional on it stays one under vmap, where a condition for
+    each member would be turned into the computation of both branches. It has no derivative.
+    """
+    return condition
+
+
+@everywhere.def_vmap
+def _everywhere_of_batch(axis_size, in_batched, condition):
+    return condition.all(0) if in_batched[0] else condition, False
+
+
+@jax.custom_batching.custom_vmap
+def largest(number: Any) -> Any:
+    """The integer itself; inside vmap, the largest of the batch, without a batch axis. It has no derivative."""
+    return number
+
+
+@largest.def_vmap
+def _largest_of_batch(axis_size, in_batched, number):
+    return number.max(0) if in_batched[0] else number, False

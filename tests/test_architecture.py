@@ -16,9 +16,11 @@ FLOORS = [
     {"camera", "materials", "bands", "footprints"},
     {"chunks"},
     {"tiles", "colliders", "transfers"},
-    {"splat", "matter"},
-    {"tile_walks", "clamp", "shells", "relocation", "starts", "overlay", "mls_mpm", "io"},
-    {"filling"},
+    {"splat", "matter", "passes"},
+    {"tile_walks", "clamp", "shells", "relocation", "starts", "overlay", "substep", "io"},
+    {"filling", "frames"},
+    {"boxes"},
+    {"mls_mpm"},
     {"segmentation", "particles", "solids", "reconstruct", "pruning"},
     {"scene"},
     {"cli"},
@@ -27,7 +29,7 @@ FLOOR_OF = {module: floor for floor, modules in enumerate(FLOORS) for module in 
 # the two worlds meet in particles.py and solids.py only
 SPLATS = {"splat", "lists", "footprints", "chunks", "bands", "tiles", "tile_walks", "clamp", "segmentation"}
 SPLATS |= {"starts", "relocation", "reconstruct", "filling", "shells", "pruning"}
-MATTER = {"matter", "mls_mpm", "transfers", "materials", "colliders"}
+MATTER = {"matter", "mls_mpm", "boxes", "frames", "substep", "passes", "transfers", "materials", "colliders"}
 
 
 def imports_of(path):

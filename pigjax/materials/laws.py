@@ -21,7 +21,7 @@ class Response(NamedTuple):
     """State of particles after a step, and the Kirchhoff stress of that state [Pa]."""
 
     F: Float[Array, "3 3 *n"]  # elastic deformation gradient
-    hardening: Float[Array, "*n"]  # as given where the law does not harden
+    hardening: Float[Array, "*n"] | None  # as given where the law does not harden
     stress: Float[Array, "3 3 *n"]
 
 

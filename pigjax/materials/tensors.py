@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from pigjax import linalg
@@ -16,9 +18,17 @@ def identity(like: Tensors) -> Float[Array, "3 3 *_"]:
     return jnp.eye(3, dtype=like.dtype).reshape(3, 3, *[1] * (like.ndim - 2))
 
 
+@jax.custom_jvp
 def product(a: Tensors, b: Tensors) -> Tensors:
     """Matrix product."""
     return a[:, 0, None] * b[0] + a[:, 1, None] * b[1] + a[:, 2, None] * b[2]
+
+
+@product.defjvp
+def _product_jvp(primals, tangents):
+    (a, b), (da, db) = primals, tangents
+    # the transpose of a sum is a broadcast, where that of slices pads each of them to the whole and adds them up
+    return product(a, b), (da[:, :, None] * b[None] + a[:, :, None] * db[None]).sum(1)
 
 
 def transpose(a: Tensors) -> Tensors:
@@ -26,15 +36,34 @@ def transpose(a: Tensors) -> Tensors:
     return jnp.swapaxes(a, 0, 1)
 
 
+@jax.custom_jvp
 def trace(a: Tensors) -> Scalars:
     """Sum of the diagonal."""
     return a[0, 0] + a[1, 1] + a[2, 2]
 
 
+@trace.defjvp
+def _trace_jvp(primals, tangents):
+    return trace(*primals), (identity(tangents[0]) * tangents[0]).sum((0, 1))
+
+
+@jax.custom_jvp
 def determinant(a: Tensors) -> Scalars:
     """Triple product of the rows."""
     (a00, a01, a02), (a10, a11, a12), (a20, a21, a22) = a
     return a00 * (a11 * a22 - a12 * a21) - a01 * (a10 * a22 - a12 * a20) + a02 * (a10 * a21 - a11 * a20)
+
+
+@determinant.defjvp
+def _determinant_jvp(primals, tangents):
+    return determinant(*primals), (cofactors(*primals) * tangents[0]).sum((0, 1))
+
+
+def cofactors(a: Tensors) -> Tensors:
+    """Derivatives of the determinant: cross products of the rows."""
+    after, next_ = a[np.array([1, 2, 0])], a[np.array([2, 0, 1])]
+    one, two = np.array([1, 2, 0]), np.array([2, 0, 1])
+    return after[:, one] * next_[:, two] - after[:, two] * next_[:, one]
 
 
 def deviator(a: Tensors) -> Tensors:

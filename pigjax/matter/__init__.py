@@ -1,15 +1,8 @@
-"""What a simulation is made of: particles and grid as users hold them, their health, and particles grouped by law."""
+"""What a simulation is made of: particles and grid as users hold them, their health, and particles by law in slots."""
 
-from pigjax.matter.groups import (
-    Group,
-    State,
-    bound_visual,
-    by_component,
-    by_particle,
-    group_by_law,
-    mark_nonfinite,
-    only_finite,
-)
+from pigjax.matter.chunks import State, tile_order, to_chunks, to_rows
+from pigjax.matter.config import SimConfig
+from pigjax.matter.groups import Group, Grouping, bound_visual, group_by_law
 from pigjax.matter.health import Health, StepHealth, perfect_health
 from pigjax.matter.state import WALL, Grid, Particles, Trajectory, fit_grid, make_particles
 
@@ -17,18 +10,19 @@ __all__ = [
     "WALL",
     "Grid",
     "Group",
+    "Grouping",
     "Health",
     "Particles",
+    "SimConfig",
     "State",
     "StepHealth",
     "Trajectory",
     "bound_visual",
-    "by_component",
-    "by_particle",
     "fit_grid",
     "group_by_law",
     "make_particles",
-    "mark_nonfinite",
-    "only_finite",
     "perfect_health",
+    "tile_order",
+    "to_chunks",
+    "to_rows",
 ]

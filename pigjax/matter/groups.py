@@ -1,53 +1,75 @@
-"""Particles grouped by law and padded to whole chunks: the form in which a simulation traces them.
+"""Particles grouped by law: the form in which a simulation holds them.
 
-A law is traced for its own particles only, so that none pays for what it does not use, and a scan over chunks keeps
-what happens to a particle inside the cache. The user's order is restored outside.
+A law is traced for its own particles only, so that none pays for what it does not use. The user's order is restored
+outside.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 
 from pigjax import linalg
 from pigjax.materials import LAWS, MaterialTable, Parameters, respond
-from pigjax.materials.tensors import identity
-from pigjax.matter.state import Particles
-
-
-class State(NamedTuple):
-    """What changes of the particles of one law; a component's axes stand last, or first after `by_component`."""
-
-    x: Array
-    v: Array
-    C: Array
-    F: Array
-    stress: Array  # Kirchhoff, of F [Pa]: the return map that finds F finds it too
-    hardening: Array
-    F_visual: Array | None  # None where F is the total deformation
+from pigjax.matter.chunks import State
+from pigjax.matter.state import Grid, Particles, Trajectory
 
 
 class Group(NamedTuple):
     """What does not change of the particles of one law."""
 
-    law: str
-    mass: Float[Array, "k c"]
-    volume0: Float[Array, "k c"]  # 0 for particles that only fill the last chunk
-    parameters: Parameters  # one row for all, or one for each particle
+    law: str  # static
+    parameters: Parameters  # one row, or one for each material of the law
 
 
-def group_by_law(
-    particles: Particles, table: MaterialTable, chunk: int | None
-) -> tuple[tuple[Group, ...], tuple[State, ...], Particles | None, Callable[[tuple[State, ...]], Particles]]:
-    """Groups and states of the laws that move, the matter that does not, and the way back from states to particles.
+class Grouping(NamedTuple):
+    """Particles taken apart by law, and the way back."""
 
-    The sizes are static, from `particles.counts`; `chunk` is the most particles of a chunk, None for no limit.
+    groups: tuple[Group, ...]  # of the laws that move
+    states: tuple[State, ...]
+    still: Particles | None  # matter that does not move
+    parts: list[Particles]  # of all laws
+    moves: list[bool]
+    order: Array | None  # of the particles in the parts, None if it is the user's
+
+    def particles(self, states: tuple[State, ...], grid: Grid) -> Particles:
+        """Particles in the user's order in the states that the groups have reached."""
+        remaining = iter(states)
+        moved = [
+            _ungroup(part, next(remaining), grid) if moves else part for part, moves in zip(self.parts, self.moves)
+        ]
+        return jax.tree.map(lambda *pieces: self._merge(pieces), *moved)
+
+    def path(self, paths: tuple[State, ...], grid: Grid) -> Trajectory:
+        """Trajectory of all particles from states with an axis of frames before that of particles."""
+        remaining = iter(paths)
+        pieces = []
+        for part, moves in zip(self.parts, self.moves):
+            if moves:
+                count = len(part)
+                state = jax.tree.map(lambda rows, count=count: rows[:, :count], next(remaining))
+                visual = state.F if state.visual is None else state.visual
+                pieces.append((_positions(state, grid), state.v, visual.reshape(*visual.shape[:2], 3, 3)))
+            else:
+                pieces.append((part.x[None], part.v[None], part.F_visual[None]))
+        frames = max(x.shape[0] for x, _, _ in pieces)
+        full = [[jnp.broadcast_to(a, (frames, *a.shape[1:])) for a in piece] for piece in pieces]
+        return Trajectory(*(self._merge(arrays, axis=1) for arrays in zip(*full)))
+
+    def _merge(self, pieces, axis=0):
+        merged = jnp.concatenate(pieces, axis)
+        return merged if self.order is None else jnp.take(merged, jnp.argsort(self.order), axis)
+
+
+def group_by_law(particles: Particles, table: MaterialTable, grid: Grid, pieces: int) -> Grouping:
+    """Particles by law.
+
+    The sizes are static, from `particles.counts`, made whole multiples of `pieces` by particles without mass.
     """
     rows_of = {law: [row for row, other in enumerate(table.laws) if other == law] for law in table.laws}
     sizes = {law: sum(particles.counts[row] for row in rows) for law, rows in rows_of.items()}
@@ -58,92 +80,93 @@ def group_by_law(
         order = jnp.argsort(rank[particles.material], stable=True)
 
     parts = _split(particles if order is None else _reorder(particles, order), [sizes[law] for law in laws])
-    moving = [LAWS[law].respond is not None for law in laws]
+    moves = [LAWS[law].respond is not None for law in laws]
     pairs = [
-        _group(law, part, rows_of[law], table, chunk or len(part))
-        for law, part, moves in zip(laws, parts, moving)
-        if moves
+        _group(law, part, rows_of[law], table, grid, pieces) for law, part, moving in zip(laws, parts, moves) if moving
     ]
-    still = next((part for part, moves in zip(parts, moving) if not moves), None)
-
-    def restore(states):
-        remaining = iter(states)
-        moved = [_ungroup(part, next(remaining)) if moves else part for part, moves in zip(parts, moving)]
-        merged = jax.tree.map(lambda *pieces: jnp.concatenate(pieces), *moved)
-        return merged if order is None else _reorder(merged, jnp.argsort(order))
-
-    return tuple(group for group, _ in pairs), tuple(state for _, state in pairs), still, restore
+    still = next((part for part, moving in zip(parts, moves) if not moving), None)
+    groups, states = tuple(group for group, _ in pairs), tuple(state for _, state in pairs)
+    return Grouping(groups, states, still, parts, moves, order)
 
 
-def by_component(state: State) -> State:
-    """Particles [c ...] last instead of first, as the laws and the transfers hold them."""
-    return jax.tree.map(lambda array: jnp.moveaxis(array, 0, -1), state)
+def by_component(rows: Array) -> Array:
+    """Tensors [3 3 c] of nine rows [9 c]."""
+    return rows.reshape(3, 3, -1)
 
 
-def by_particle(state: State) -> State:
-    """Inverse of `by_component`."""
-    return jax.tree.map(lambda array: jnp.moveaxis(array, -1, 0), state)
-
-
-def only_finite(state: State) -> tuple[Bool[Array, "c"], State]:
-    """Which particles are still finite, and a state at rest in place of the others, whose derivative is zero.
-
-    Takes and returns a state by component.
-    """
-    ok = jnp.isfinite(state.x).all(0)
-    rest = jax.tree.map(jnp.zeros_like, state)._replace(F=identity(state.F))
-    return ok, jax.tree.map(lambda leaf, safe: jnp.where(ok, leaf, safe), state, rest)
-
-
-def mark_nonfinite(state: State) -> State:
-    """Position NaN where anything of a particle is not finite, in a state by component."""
-    total = sum(leaf.sum(range(leaf.ndim - 1)) for leaf in jax.tree.leaves(state))
-    return state._replace(x=jnp.where(jnp.isfinite(total), state.x, jnp.nan))
+def by_row(tensors: Array) -> Array:
+    """Nine rows [9 c] of tensors [3 3 c]."""
+    return tensors.reshape(9, -1)
 
 
 def bound_visual(state: State, stretch: tuple[float, float]) -> State:
     """Hold the stretches of F_visual in bounds: flow without end would otherwise draw needles."""
-    if state.F_visual is None:
+    if state.visual is None:
         return state
-    u, s, v = linalg.svd(state.F_visual)
+    u, s, v = linalg.svd(state.visual.reshape(-1, 3, 3))
     s = jnp.clip(s, *stretch)
-    return state._replace(F_visual=linalg.matmul3(u * s[..., None, :], linalg.transpose(v)))
+    return state._replace(visual=linalg.matmul3(u * s[..., None, :], linalg.transpose(v)).reshape(-1, 9))
 
 
-def _group(law, part, rows, table, limit):
-    """Particles of one law in whole chunks, the last particle repeated without mass, with their present stress."""
-    count = len(part)
-    chunks = -(-count // limit)
-    size = -(-count // chunks)
+def _group(law, part, rows, table, grid, pieces):
+    """Particles of one law with their present stress, at rest and without mass where they are not finite."""
+    kind, several = LAWS[law], len(rows) > 1
+    parameters = table.rows(np.array(rows) if several else rows[0])
+    own_row = jnp.searchsorted(jnp.asarray(rows), part.material)
+    leaves = [part.x, part.v, part.F, part.C, part.hardening[:, None]] + ([] if kind.total else [part.F_visual])
+    ok = jnp.isfinite(sum(leaf.reshape(len(part), -1).sum(1) for leaf in leaves))
 
-    def chunked(array):
-        padding = [(0, chunks * size - count)] + [(0, 0)] * (array.ndim - 1)
-        return jnp.pad(array, padding, mode="edge").reshape(chunks, size, *array.shape[1:])
+    def sound(values, safe):
+        values = values.reshape(len(part), -1)
+        return jnp.where(ok[:, None], values, jnp.asarray(safe, values.dtype))
 
-    real = (np.arange(chunks * size) < count).reshape(chunks, size)
-    mass, volume = (jnp.where(real, chunked(array), 0.0) for array in (part.mass, part.volume0))
-    parameters = table.rows(rows[0] if len(rows) == 1 else part.material)
+    eye = np.eye(3).reshape(-1)
+    cells = (part.x - grid.origin) / grid.dx
+    state = State(
+        cells=sound(cells, np.array(grid.shape) / 2),
+        v=sound(part.v, 0),
+        C=sound(part.C, 0),
+        F=sound(part.F, eye),
+        stress=jnp.zeros((len(part), 9), part.x.dtype),
+        mass=sound(part.mass, 0),
+        volume=sound(part.volume0, 0),
+        hardening=sound(part.hardening, 0),
+        visual=None if kind.total else sound(part.F_visual, eye),
+        row=own_row.astype(part.x.dtype)[:, None] if several else None,
+    )
+    F, rate = by_component(state.F.T), by_component(state.C.T)
+    of_each = jax.tree.map(lambda p: p[own_row], parameters) if several else parameters
+    F, hardening, stress = respond(law, F, rate, 0.0, state.hardening[:, 0], of_each)
+    state = state._replace(
+        F=by_row(F).T, stress=by_row(stress).T, hardening=None if hardening is None or not kind.hardens else hardening[:, None]
+    )
+    padding = -len(part) % pieces
+    if padding:
+        state = jax.tree.map(lambda rows: jnp.pad(rows, ((0, padding), (0, 0)), mode="edge"), state)
+        state = state._replace(**{name: getattr(state, name).at[-padding:].set(0) for name in ("mass", "volume")})
+    return Group(law, parameters), state
 
-    visual = None if LAWS[law].total else part.F_visual
-    state = State(part.x, part.v, part.C, part.F, jnp.zeros_like(part.F), part.hardening, visual)
-    ok, state = only_finite(mark_nonfinite(by_component(state)))
-    F, hardening, stress = respond(law, state.F, state.C, 0.0, state.hardening, parameters)
-    state = state._replace(x=jnp.where(ok, state.x, jnp.nan), F=F, hardening=hardening, stress=stress)
-    state = jax.tree.map(chunked, by_particle(mark_nonfinite(state)))
-    if len(rows) > 1:
-        parameters = jax.tree.map(chunked, parameters)
-    return Group(law, mass, volume, parameters), state
 
-
-def _ungroup(part, state):
-    """Particles with the state that their group has reached."""
-    flat = jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:])[: len(part)], state)
-    visual = flat.F if flat.F_visual is None else flat.F_visual
+def _ungroup(part, state, grid):
+    """Particles with the state that their group has reached; x is NaN of those that are no longer finite."""
+    state = jax.tree.map(lambda rows: rows[: len(part)], state)
+    F = state.F.reshape(-1, 3, 3)
     return eqx.tree_at(
         lambda p: (p.x, p.v, p.C, p.F, p.hardening, p.F_visual),
         part,
-        (flat.x, flat.v, flat.C, flat.F, flat.hardening, visual),
+        (
+            _positions(state, grid),
+            state.v,
+            state.C.reshape(-1, 3, 3),
+            F,
+            part.hardening if state.hardening is None else state.hardening[:, 0],
+            F if state.visual is None else state.visual.reshape(-1, 3, 3),
+        ),
     )
+
+
+def _positions(state, grid):
+    return jnp.where(state.volume > 0, grid.origin + grid.dx * state.cells, jnp.nan)
 
 
 def _split(particles, sizes):

@@ -1,0 +1,128 @@
+"""The part of the grid that a simulation needs, fitted anew from frame to frame (host).
+
+The same matter costs the same in a small domain and in a vast one. A box whose edge matter has reached means that
+the frame is computed again in a larger one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pigjax.errors import SimulationError
+from pigjax.frames import Box, run_frames
+from pigjax.materials import MaterialTable
+from pigjax.matter import Grid, Health, Particles, SimConfig, Trajectory
+
+_SMALL = 50_000  # nodes that need no box: less than other costs of a step
+_LARGEST = 200_000_000  # nodes
+_PER_DEVICE = 4096  # particles that are worth a device of their own
+
+
+def run_in_boxes(
+    particles: Particles, domain: Grid, table: MaterialTable, config: SimConfig, *, frames: int, **step
+) -> tuple[Particles, Trajectory, Health]:
+    """Simulate frame by frame, each on the box that it needs; `step` is what `run_frames` takes."""
+    devices = devices_for(config, len(particles))
+    if math.prod(domain.shape) <= _SMALL:
+        box, start = whole(domain), jnp.zeros_like(step["dt"])
+        return run_frames(particles, box, table, config, devices, start=start, frames=frames, **step)[:3]
+    fit = _Fit()
+    duration = step["dt"] * step["substeps"]
+    paths, healths = [], []
+    for frame in range(frames):
+        particles, path, health = fit.frame(
+            particles, domain, table, config, devices, start=duration * frame, frames=1, **step
+        )
+        paths.append(path)
+        healths.append(health)
+        if config.stop and health.first_bad_frame >= 0:
+            paths += [path] * (frames - frame - 1)
+            break
+    joined = jax.tree.map(lambda *pieces: jnp.concatenate(pieces), *paths)
+    return particles, joined, _worst(healths)
+
+
+def whole(domain: Grid) -> Box:
+    """The box that is all of the domain."""
+    return Box(domain, jnp.zeros(3, jnp.int32), jnp.asarray(domain.shape, jnp.int32))
+
+
+def devices_for(config: SimConfig, count: int) -> int:
+    """How many local devices share so many particles."""
+    if config.devices is not None:
+        return config.devices
+    if jax.sharding.get_abstract_mesh().manual_axes:  # somebody else shares out the devices already
+        return 1
+    return max(1, min(jax.local_device_count(), count // _PER_DEVICE))
+
+
+@dataclass
+class _Fit:
+    """What the last frame has taught."""
+
+    shape: tuple[int, int, int] = (0, 0, 0)
+    slack: float = 2.0  # cells around where matter is and is heading
+
+    def frame(self, particles, domain, table, config, devices, **step):
+        """One frame, as often as it takes."""
+        ahead = _ways(particles, step["dt"] * step["substeps"], step["gravity"])
+        while True:
+            box = self._box(ahead, domain)
+            moved, path, health, met = run_frames(particles, box, table, config, devices, **step)
+            low, high = np.asarray(met).T
+            size, first = np.array(box.grid.shape), np.asarray(box.low)
+            inner = (low & (first > 0)) | (high & (first + size < np.array(domain.shape)))
+            if not inner.any():
+                return moved, path, health
+            self.slack *= 2
+
+    def _box(self, ahead, domain):
+        cells = (ahead - np.asarray(domain.origin, np.float64)) / float(domain.dx)
+        sides = np.array(domain.shape)
+        cells = np.clip(cells[np.isfinite(cells).all(-1)], 0, sides - 1)
+        if not len(cells):
+            cells = np.zeros((1, 3))
+        low = np.floor(cells.min(0) - self.slack).astype(int) - 1
+        high = np.ceil(cells.max(0) + self.slack).astype(int) + 1
+        shape = np.array([_round_up(n) for n in high - low + 1])
+        if np.prod(self.shape) <= 2 * np.prod(shape):
+            shape = np.maximum(shape, self.shape)
+        shape = np.minimum(shape, sides)
+        if (nodes := int(np.prod(shape))) > _LARGEST:
+            raise SimulationError(
+                f"matter has spread so far that its grid needs {nodes:.2g} nodes (at most {_LARGEST:.2g}); catch what"
+                " falls with a plane, or take a coarser grid."
+            )
+        low = np.clip(low - (shape - (high - low + 1)) // 2, 0, sides - shape)
+        nx, ny, nz = map(int, shape)
+        self.shape = nx, ny, nz
+        origin = domain.origin + jnp.asarray(low, domain.origin.dtype) * domain.dx
+        grid = Grid(origin, domain.dx, self.shape)
+        return Box(grid, jnp.asarray(low, jnp.int32), jnp.asarray(sides, jnp.int32))
+
+
+def _ways(particles, duration, gravity):
+    """Where particles are, and where they would be after a while of free flight."""
+    x, v = (np.asarray(a, np.float64) for a in (particles.x, particles.v))
+    duration = float(duration)
+    return np.concatenate([x, x + v * duration + 0.5 * np.asarray(gravity) * duration**2])
+
+
+def _round_up(nodes):
+    """Sides come in steps of an eighth or so, so that a box seldom changes its size."""
+    unit = max(4, 1 << (int(nodes - 1).bit_length() - 3))
+    return max(-(-nodes // unit) * unit, 8)
+
+
+def _worst(healths):
+    worst = healths[0]
+    for health in healths[1:]:
+        worst = worst.worse(health)
+    bad = [k for k, health in enumerate(healths) if health.first_bad_frame >= 0]
+    first = jnp.asarray(bad[0] if bad else -1)
+    return Health(**(vars(worst) | {"first_bad_frame": first}))

@@ -1,0 +1,170 @@
+"""The compiled simulation: frames of substeps on one box of the grid, on one device or shared by several."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int
+
+from pigjax.arrays import everywhere
+from pigjax.colliders import Collider
+from pigjax.materials import MaterialTable
+from pigjax.matter import (
+    Grid,
+    Health,
+    Particles,
+    SimConfig,
+    StepHealth,
+    Trajectory,
+    bound_visual,
+    group_by_law,
+    perfect_health,
+    tile_order,
+    to_chunks,
+    to_rows,
+)
+from pigjax.substep import Scene, Setting, Watch, advance, touched_nodes
+from pigjax.transfers import KERNELS
+
+_AXIS = "particles"
+
+
+class Box(eqx.Module):
+    """The nodes in use: a part of the domain."""
+
+    grid: Grid
+    low: Int[Array, "3"]  # node of the domain where the box begins
+    domain: Int[Array, "3"]  # nodes of the domain a side
+
+
+@eqx.filter_jit
+def run_frames(
+    particles: Particles,
+    box: Box,
+    table: MaterialTable,
+    config: SimConfig,
+    devices: int,
+    *,
+    dt: Float[Array, ""],
+    gravity: Float[Array, "3"],
+    colliders: tuple[Collider, ...],
+    start: Float[Array, ""],
+    frames: int,
+    substeps: int,
+) -> tuple[Particles, Trajectory, Health, Bool[Array, "3 2"]]:
+    """Simulate from a time `start` [s] after the colliders were where they say; also tells the sides that were met."""
+    kernel, dtype = KERNELS[config.kernel], particles.x.dtype
+    grid = box.grid
+    grouping = group_by_law(particles, table, grid, devices)
+    states = grouping.states
+    # neighbours beside each other: in the cache, and on the same device
+    orders = [tile_order(state.cells, grid.shape) for state in states]
+    states = tuple(_take(state, order) for state, order in zip(states, orders))
+    points = grid.points
+    still = grouping.still
+    scene = Scene(
+        parameters=tuple(group.parameters for group in grouping.groups),
+        grid=grid,
+        low=box.low,
+        domain=box.domain,
+        dt=dt,
+        gravity=gravity,
+        colliders=colliders,
+        contacts=tuple(c.contact(points) if c.velocity is None else None for c in colliders),
+        frozen=None if still is None else touched_nodes(grid, still.x, kernel),
+        unit_mass=lax.stop_gradient(particles.mass.max()),
+        go=everywhere(particles.volume0[0] > -1),
+    )
+    setting = Setting(
+        kernel=kernel,
+        walls=config.walls,
+        laws=tuple(group.law for group in grouping.groups),
+        ruled=config.differentiation == "reverse",
+        axis=_AXIS if devices > 1 else None,
+        fillers=sum(-len(part) % devices for part, moves in zip(grouping.parts, grouping.moves) if moves),
+    )
+    nothing = Watch(perfect_health(dtype), jnp.zeros((3, 2), bool))
+    run = partial(_frames, setting, config, frames, substeps)
+    if devices > 1:
+        whole, shared = PartitionSpec(), PartitionSpec(_AXIS)
+        mesh = Mesh(np.array(jax.local_devices()[:devices]), (_AXIS,))
+        run = jax.shard_map(
+            run,
+            mesh=mesh,
+            in_specs=(whole, shared, whole, whole),
+            out_specs=(shared, PartitionSpec(None, _AXIS), whole),
+            check_vma=False,  # of loops whose carries would need marks
+        )
+    states, paths, (health, met) = run(scene, states, start, nothing)
+    back = [jnp.argsort(order) for order in orders]
+    states = tuple(_take(state, order) for state, order in zip(states, back))
+    paths = tuple(_take(path, order, 1) for path, order in zip(paths, back))
+    return grouping.particles(states, grid), grouping.path(paths, grid), health, met
+
+
+def _frames(setting, config, frames, substeps, scene, states, start, nothing):
+    """Frames of substeps on this device's share of the particles."""
+    block = _block_length(substeps, frames)
+    counts = [len(state.cells) for state in states]
+
+    def substep(carry, _):
+        states, watch, steps = carry
+        states, own = advance(setting, scene, states, start + steps * scene.dt, nothing)
+        return (states, watch.worse(own), steps + 1), None
+
+    @partial(jax.checkpoint, prevent_cse=False)
+    def steps_of_block(carry, _):
+        return lax.scan(substep, carry, None, length=block)
+
+    def frame(carry, _):
+        states, worst, steps, stopped = carry
+        chunks = tuple(to_chunks(state, config.chunk) for state in states)
+        (chunks, watch, steps), _ = lax.scan(steps_of_block, (chunks, nothing, steps), None, length=substeps // block)
+        moved = tuple(
+            bound_visual(to_rows(chunk, count), config.visual_stretch) for chunk, count in zip(chunks, counts)
+        )
+        watch = _counted(setting, watch, moved)
+        bad = watch.health.is_bad()
+        if config.stop:
+            stopped = stopped | bad
+            moved = jax.tree.map(lambda new, old: jnp.where(stopped, old, new), moved, states)
+        seen = tuple(s._replace(C=None, stress=None, mass=None, hardening=None, row=None) for s in moved)
+        return (moved, worst.worse(watch), steps, stopped), (seen, bad)
+
+    carry = (states, nothing, jnp.zeros((), int), jnp.zeros((), bool))
+    (states, worst, _, _), (paths, bad) = lax.scan(frame, carry, None, length=frames)
+    first_bad = jnp.where(bad.any(), jnp.argmax(bad), -1)
+    health = Health(**vars(worst.health), substeps=jnp.asarray(substeps), first_bad_frame=first_bad)
+    return states, paths, (health, worst.met)
+
+
+def _counted(setting, watch, states):
+    """The health of all devices, with the particles that are not finite."""
+    health = watch.health
+    gone = sum((state.volume <= 0).sum() for state in states)
+    counts = jnp.stack([health.escaped, health.inverted, gone])
+    least, most, met = health.min_J, health.max_courant, watch.met
+    if setting.axis is not None:
+        counts = lax.psum(counts, setting.axis)
+        least, most = lax.pmin(least, setting.axis), lax.pmax(most, setting.axis)
+        met = lax.pmax(met.astype(int), setting.axis) > 0
+    escaped, inverted, gone = counts
+    health = StepHealth(least, most, escaped, gone - setting.fillers, inverted)
+    return Watch(jax.tree.map(lax.stop_gradient, health), met)
+
+
+def _block_length(substeps, frames):
+    """Largest divisor of the substeps of a frame that is not above the root of all substeps."""
+    most = math.isqrt(frames * substeps)
+    return next(n for n in range(min(substeps, most), 0, -1) if substeps % n == 0)
+
+
+def _take(state, order, axis=0):
+    return jax.tree.map(lambda rows: jnp.take(rows, order, axis), state)

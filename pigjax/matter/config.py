@@ -1,0 +1,53 @@
+"""Every choice of a simulation that is compiled in."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+
+from pigjax.arrays import static_field
+from pigjax.errors import InputError
+from pigjax.transfers import KERNELS
+
+_WALLS = ("separate", "slip", "sticky")
+_INTEGRATORS = ("explicit",)
+_DIFFERENTIATION = ("reverse", "forward")
+
+
+class SimConfig(eqx.Module):
+    """Every choice of the simulation that is compiled in.
+
+    Raises:
+        InputError: a choice does not exist.
+    """
+
+    kernel: str = static_field(default="quadratic")  # or "cubic": smoother, 2.4 times as many nodes
+    integrator: str = static_field(default="explicit")
+    substeps: int | None = static_field(default=None)  # per frame; None: the fewest that are stable
+    cfl: float = static_field(default=0.4)  # share of a cell that waves and particles cross in a step
+    walls: str = static_field(default="separate")  # of the domain: "separate", "slip" or "sticky"
+    visual_stretch: tuple[float, float] = static_field(default=(0.2, 5.0))  # bounds of F_visual's singular values
+    force: bool = static_field(default=False)  # run steps longer than the stable limit
+    stop: bool = static_field(default=False)  # at the first bad frame: the rest repeats the last good one
+    devices: int | None = static_field(default=None)  # that share the particles; None: all local ones, if it pays
+    differentiation: str = static_field(default="reverse")  # or "forward": for jvp, jacfwd and hessian
+    chunk: int | None = static_field(default=None)  # particles handled at once; None: 512 on a CPU, else all
+
+    def __check_init__(self):
+        for name, value, choices in (
+            ("kernel", self.kernel, KERNELS),
+            ("integrator", self.integrator, _INTEGRATORS),
+            ("walls", self.walls, _WALLS),
+            ("differentiation", self.differentiation, _DIFFERENTIATION),
+        ):
+            if value not in choices:
+                raise InputError(f"SimConfig.{name} = {value!r}: choose one of {', '.join(choices)}.")
+        if self.substeps is not None and self.substeps < 1:
+            raise InputError(f"SimConfig.substeps = {self.substeps}: must be 1 or more.")
+        if not self.cfl > 0:
+            raise InputError(f"SimConfig.cfl = {self.cfl}: must be > 0.")
+        if self.devices is not None and not 1 <= self.devices <= jax.local_device_count():
+            raise InputError(
+                f"SimConfig.devices = {self.devices}: JAX has {jax.local_device_count()} local devices; on a CPU set"
+                f' jax.config.update("jax_num_cpu_devices", {self.devices}) before anything else.'
+            )

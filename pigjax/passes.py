@@ -1,0 +1,134 @@
+"""Loops over chunks of particles that add to a grid or read from one, with their own reverse-mode rule.
+
+In reverse mode each chunk is computed anew and its windows are met as in the forward pass: what added to the grid reads
+the grid's cotangent, and what read from it adds. Forward mode differentiates the plain loops (`ruled=False`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from pigjax.transfers import Kernel, add_windows, first_nodes, stage, take_windows
+
+
+class Pass(NamedTuple):
+    """What is static of a loop over chunks."""
+
+    function: Callable  # of a chunk
+    kernel: Kernel
+    shape: tuple[int, int, int]  # nodes of the grid
+
+
+def scatter_chunks(
+    own: Pass, go: Bool[Array, ""], cells: Float[Array, "n 3 c"], chunks: Any, shared: Any, *, ruled: bool
+) -> Float[Array, "x y z 4"]:
+    """Grid to which each chunk at `cells` adds its windows, `own.function(go, cells, chunk, shared)` [n n n 4 c]."""
+    run = _ruled_scatter if ruled else _scatter
+    return run(own, go, (cells, chunks), shared)
+
+
+def gather_chunks(
+    own: Pass, go: Bool[Array, ""], grid: Float[Array, "x y z 3"], chunks: Any, shared: Any, health: Any, *, ruled: bool
+) -> tuple[Any, Any]:
+    """Chunks after `own.function(go, windows, chunk, shared)` with windows [n n n 3 c], and the worst health of them.
+
+    The function returns the chunk's new arrays in the form of the old ones, whose first are the cells [n 3 c], and its
+    health, which has no derivative.
+    """
+    run = _ruled_gather if ruled else _gather
+    return run(own, go, grid, chunks, shared, health)
+
+
+def _scatter(own, go, chunks, shared):
+    def visit(i, grid):
+        cells, chunk = _chunk(chunks, i)
+        return add_windows(grid, _first(own, go, cells), own.function(go, cells, chunk, shared))
+
+    return lax.fori_loop(0, len(chunks[0]), visit, jnp.zeros((*own.shape, 4), chunks[0].dtype))
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _ruled_scatter(own, go, chunks, shared):
+    return _scatter(own, go, chunks, shared)
+
+
+def _scatter_forward(own, go, chunks, shared):
+    return _scatter(own, go, chunks, shared), (go, chunks, shared)
+
+
+def _scatter_backward(own, residuals, cotangent):
+    go, chunks, shared = residuals
+
+    def visit(i, carry):
+        of_chunks, of_shared = carry
+        cells, chunk = _chunk(chunks, i)
+        windows = take_windows(cotangent, _first(own, go, cells), own.kernel)
+        _, pull = jax.vjp(partial(own.function, go), cells, chunk, shared)
+        *of_chunk, more = pull(windows)
+        return _put(of_chunks, i, tuple(of_chunk)), jax.tree.map(jnp.add, of_shared, more)
+
+    zeros = jax.tree.map(jnp.zeros_like, (chunks, shared))
+    return (None, *lax.fori_loop(0, len(chunks[0]), visit, zeros))
+
+
+_ruled_scatter.defvjp(_scatter_forward, _scatter_backward)
+
+
+def _gather(own, go, grid, chunks, shared, health):
+    def visit(i, carry):
+        chunks, health = carry
+        chunk = _chunk(chunks, i)
+        windows = take_windows(grid, _first(own, go, chunk[0]), own.kernel)
+        new, more = own.function(go, windows, chunk, shared)
+        return _put(chunks, i, new), health.worse(more)
+
+    return lax.fori_loop(0, len(chunks[0]), visit, (chunks, health))
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _ruled_gather(own, go, grid, chunks, shared, health):
+    return _gather(own, go, grid, chunks, shared, health)
+
+
+def _gather_forward(own, go, grid, chunks, shared, health):
+    return _gather(own, go, grid, chunks, shared, health), (go, grid, chunks, shared)
+
+
+def _gather_backward(own, residuals, cotangents):
+    go, grid, chunks, shared = residuals
+    cotangent, _ = cotangents
+
+    def visit(i, carry):
+        of_grid, of_chunks, of_shared = carry
+        chunk = _chunk(chunks, i)
+        first = _first(own, go, chunk[0])
+        windows = take_windows(grid, first, own.kernel)
+        _, pull, _ = jax.vjp(partial(own.function, go), windows, chunk, shared, has_aux=True)
+        of_windows, of_chunk, more = pull(_chunk(cotangent, i))
+        of_grid = add_windows(of_grid, first, of_windows)
+        return of_grid, _put(of_chunks, i, of_chunk), jax.tree.map(jnp.add, of_shared, more)
+
+    zeros = jax.tree.map(jnp.zeros_like, (grid, chunks, shared))
+    return (None, *lax.fori_loop(0, len(chunks[0]), visit, zeros), None)
+
+
+_ruled_gather.defvjp(_gather_forward, _gather_backward)
+
+
+def _first(own, go, cells):
+    return stage(go, lambda cells: first_nodes(cells, own.kernel, own.shape), cells)
+
+
+def _chunk(arrays, i):
+    return jax.tree.map(lambda a: lax.dynamic_index_in_dim(a, i, keepdims=False), arrays)
+
+
+def _put(arrays, i, chunk):
+    return jax.tree.map(lambda a, c: lax.dynamic_update_index_in_dim(a, c, i, 0), arrays, chunk)

@@ -1,0 +1,213 @@
+"""One explicit substep of MLS-MPM with APIC on particles in chunks: to the grid, grid update, back to the particles."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from pigjax.colliders import Collider, Contact
+from pigjax.materials import Parameters, respond
+from pigjax.materials.tensors import determinant, product
+from pigjax.matter import WALL, Grid, State, StepHealth
+from pigjax.matter.groups import by_component, by_row
+from pigjax.passes import Pass, gather_chunks, scatter_chunks
+from pigjax.transfers import (
+    Kernel,
+    distances,
+    first_nodes,
+    from_windows,
+    ruled_from_windows,
+    ruled_to_windows,
+    stage,
+    to_windows,
+)
+
+
+class Setting(NamedTuple):
+    """What is compiled in."""
+
+    kernel: Kernel
+    walls: str
+    laws: tuple[str, ...]  # that move
+    ruled: bool  # reverse mode by the rules of `passes`
+    axis: str | None  # over which devices share the particles
+    fillers: int  # particles without mass that even out the devices' shares
+
+
+class Scene(NamedTuple):
+    """What all steps of a simulation share."""
+
+    parameters: tuple[Parameters, ...]  # of each law
+    grid: Grid  # the box of nodes in use
+    low: Int[Array, "3"]  # node of the domain where the box begins
+    domain: Int[Array, "3"]  # nodes of the domain a side
+    dt: Float[Array, ""]
+    gravity: Float[Array, "3"]
+    colliders: tuple[Collider, ...]
+    contacts: tuple[Contact | None, ...]  # of the colliders that do not move
+    frozen: Bool[Array, "nx ny nz"] | None  # nodes that stationary matter touches
+    unit_mass: Float[Array, ""]  # of the heaviest particle [kg]
+    go: Bool[Array, ""]  # for `transfers.stage`
+
+
+class Watch(eqx.Module):
+    """Health of a step, and whether the box was large enough."""
+
+    health: StepHealth
+    met: Bool[Array, "3 2"]  # sides of the box that held a particle back
+
+    def worse(self, other: Watch) -> Watch:
+        """The worse of two, number by number."""
+        return Watch(self.health.worse(other.health), self.met | other.met)
+
+
+def advance(
+    setting: Setting, scene: Scene, states: tuple[State, ...], time: Array, nothing: Watch
+) -> tuple[tuple[State, ...], Watch]:
+    """One step of all groups."""
+    velocity = _update_grid(setting, scene, _to_grid(setting, scene, states), time)
+    watch, moved = nothing, []
+    for law, parameters, state in zip(setting.laws, scene.parameters, states):
+        take = Pass(partial(_take, setting, scene.grid.shape, law), setting.kernel, scene.grid.shape)
+        shared = (scene.dt, scene.grid.dx, parameters)
+        state, own = gather_chunks(take, scene.go, velocity, state, shared, nothing, ruled=setting.ruled)
+        moved.append(state)
+        watch = watch.worse(own)
+    return tuple(moved), watch
+
+
+def _to_grid(setting, scene, states):
+    """Mass and momentum of the nodes [nx ny nz 4], stress included."""
+    give = Pass(partial(_give, setting, scene.grid.shape), setting.kernel, scene.grid.shape)
+    shared = (scene.dt, scene.grid.dx)
+    total: Array | float = 0.0
+    for state in states:
+        given = (state.v, state.C, state.stress, state.mass, state.volume)
+        total = total + scatter_chunks(give, scene.go, state.cells, given, shared, ruled=setting.ruled)
+    return total if setting.axis is None else lax.psum(total, setting.axis)
+
+
+def _give(setting, shape, go, cells, chunk, shared):
+    """Windows of a chunk."""
+    dt, dx = shared
+    v, _, _, mass, _ = chunk
+    transfer = ruled_to_windows if setting.ruled else to_windows
+
+    def affine(v, C, stress, mass, volume):
+        force = (-dt * setting.kernel.inverse_inertia / dx) * volume * by_component(stress)
+        return dx * mass * by_component(C) + force
+
+    distance = stage(go, lambda cells: distances(cells, setting.kernel, shape), cells)
+    return transfer(setting.kernel, go, distance, mass[0], v, stage(go, affine, *chunk))
+
+
+def _take(setting, shape, law, go, windows, state, shared):
+    """A chunk after the step, and its health."""
+    dt, dx, parameters = shared
+    transfer = ruled_from_windows if setting.ruled else from_windows
+    distance = stage(go, lambda cells: distances(cells, setting.kernel, shape), state.cells)
+    v, per_cell = transfer(setting.kernel, go, distance, windows)
+    new = stage(go, partial(_respond, law), state, v, per_cell, dt, dx, parameters)
+    return stage(go, partial(_check, shape), new, state.volume, dt, dx)
+
+
+def _check(shape, state, volume, dt, dx):
+    """The state held inside the grid, what is not finite taken out, and its health."""
+    held = jnp.clip(state.cells, 1, (np.array(shape)[:, None] - 2.0).astype(state.cells.dtype))
+    alive = volume[0] > 0
+    J = determinant(by_component(state.F))
+    out = jnp.stack([state.cells < held, state.cells > held], 1) & alive
+    watch = Watch(
+        health=StepHealth(
+            min_J=jnp.where(alive, J, jnp.inf).min(),
+            max_courant=jnp.sqrt(jnp.where(alive, (state.v**2).sum(0), 0.0).max()) * dt / dx,
+            escaped=out.any((0, 1)).sum(),
+            nonfinite=jnp.zeros((), int),
+            inverted=(alive & (J <= 0)).sum(),
+        ),
+        met=out.any(2),
+    )
+    return _only_finite(state._replace(cells=held), shape), jax.tree.map(lax.stop_gradient, watch)
+
+
+def _respond(law, state, v, per_cell, dt, dx, parameters):
+    """State after the particles moved and their matter responded."""
+    rate = per_cell / dx
+    if state.row is not None:
+        parameters = _of_rows(parameters, state.row[0])
+    hardening = None if state.hardening is None else state.hardening[0]
+    F, hardening, stress = respond(law, by_component(state.F), rate, dt, hardening, parameters)
+    visual = state.visual
+    if visual is not None:
+        visual = visual + by_row(dt * product(rate, by_component(visual)))
+    return state._replace(
+        cells=state.cells + dt / dx * v,
+        v=v,
+        C=by_row(rate),
+        F=by_row(F),
+        stress=by_row(stress),
+        hardening=None if hardening is None else hardening[None],
+        visual=visual,
+    )
+
+
+def _of_rows(parameters, row):
+    """Parameters of each particle [c] from those of each material [m]; a sum whose transpose needs no scatter."""
+    count = len(jax.tree.leaves(parameters)[0])
+    return jax.tree.map(lambda p: sum(jnp.where(row == k, p[k], 0) for k in range(count)), parameters)
+
+
+def _only_finite(state, shape):
+    """Particles that are not finite are put at rest in the middle of the grid, without mass."""
+    ok = jnp.isfinite(sum(rows.sum(0) for rows in jax.tree.leaves(state)))
+    rest = jax.tree.map(jnp.zeros_like, state)._replace(
+        cells=jnp.broadcast_to((np.array(shape)[:, None] / 2).astype(state.cells.dtype), state.cells.shape),
+        F=jnp.broadcast_to(np.eye(3, dtype=state.F.dtype).reshape(9, 1), state.F.shape),
+    )
+    return jax.tree.map(lambda new, safe: jnp.where(ok, new, safe), state, rest)
+
+
+def _update_grid(setting, scene, nodes, time):
+    """Velocities of the nodes [nx ny nz 3] after gravity, colliders, stationary matter and walls."""
+    mass = nodes[..., :1] / scene.unit_mass
+    # Below this a node's mass squared, by which derivatives divide, leaves the range of floating point.
+    filled = mass > jnp.finfo(mass.dtype).tiny ** 0.5
+    velocity = nodes[..., 1:] / scene.unit_mass / jnp.where(filled, mass, 1.0) + scene.dt * scene.gravity
+    velocity = jnp.where(filled, velocity, 0.0)
+    for collider, contact in zip(scene.colliders, scene.contacts):
+        contact = collider.contact(scene.grid.points, time) if contact is None else contact
+        velocity = collider.apply(contact, velocity)
+    if scene.frozen is not None:
+        velocity = jnp.where(scene.frozen[..., None], 0.0, velocity)
+    return _apply_walls(velocity, setting.walls, scene)
+
+
+def _apply_walls(velocity, mode, scene):
+    components = [velocity[..., k] for k in range(3)]
+    for axis, nodes in enumerate(velocity.shape[:3]):
+        index = (jnp.arange(nodes) + scene.low[axis]).reshape([-1 if k == axis else 1 for k in range(3)])
+        low, high = index < WALL, index >= scene.domain[axis] - WALL
+        if mode == "sticky":
+            components = [jnp.where(low | high, 0.0, v) for v in components]
+        elif mode == "slip":
+            components[axis] = jnp.where(low | high, 0.0, components[axis])
+        else:
+            v = components[axis]
+            components[axis] = jnp.where(low, jnp.maximum(v, 0.0), jnp.where(high, jnp.minimum(v, 0.0), v))
+    return jnp.stack(components, -1)
+
+
+def touched_nodes(grid: Grid, x: Float[Array, "p 3"], kernel: Kernel) -> Bool[Array, "nx ny nz"]:
+    """Nodes in the support of particles [m]."""
+    cells = jnp.clip((x - grid.origin) / grid.dx, 1, jnp.asarray(grid.shape, x.dtype) - 2)
+    first = first_nodes(cells.T, kernel, grid.shape)
+    offsets = np.stack(np.meshgrid(*[np.arange(len(kernel.offsets))] * 3, indexing="ij"), -1).reshape(-1, 3)
+    i, j, k = jnp.moveaxis(first[:, None] + offsets, -1, 0)
+    return jnp.zeros(grid.shape, bool).at[i, j, k].set(True)
