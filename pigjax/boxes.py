@@ -31,7 +31,7 @@ def run_in_boxes(
     if math.prod(domain.shape) <= _SMALL:
         box, start = whole(domain), jnp.zeros_like(step["dt"])
         return run_frames(particles, box, table, config, devices, start=start, frames=frames, **step)[:3]
-    fit = _Fit()
+    fit = Fit()
     duration = step["dt"] * step["substeps"]
     paths, healths = [], []
     for frame in range(frames):
@@ -62,14 +62,20 @@ def devices_for(config: SimConfig, count: int) -> int:
 
 
 @dataclass
-class _Fit:
-    """What the last frame has taught."""
+class Fit:
+    """Frames of one simulation: what the last one has taught about the size of the box."""
 
     shape: tuple[int, int, int] = (0, 0, 0)
     slack: float = 2.0  # cells around where matter is and is heading
 
-    def frame(self, particles, domain, table, config, devices, **step):
-        """One frame, as often as it takes."""
+    def frame(
+        self, particles: Particles, domain: Grid, table: MaterialTable, config: SimConfig, devices: int, **step
+    ) -> tuple[Particles, Trajectory, Health]:
+        """One frame, as often as it takes.
+
+        Raises:
+            SimulationError: matter has spread so far that its grid would not fit into memory.
+        """
         ahead = _ways(particles, step["dt"] * step["substeps"], step["gravity"])
         while True:
             box = self._box(ahead, domain)
@@ -101,8 +107,8 @@ class _Fit:
         low = np.clip(low - (shape - (high - low + 1)) // 2, 0, sides - shape)
         nx, ny, nz = map(int, shape)
         self.shape = nx, ny, nz
-        origin = domain.origin + jnp.asarray(low, domain.origin.dtype) * domain.dx
-        grid = Grid(origin, domain.dx, self.shape)
+        origin = np.asarray(domain.origin, np.float64) + low * float(domain.dx)
+        grid = Grid(jnp.asarray(origin, domain.origin.dtype), domain.dx, self.shape)
         return Box(grid, jnp.asarray(low, jnp.int32), jnp.asarray(sides, jnp.int32))
 
 

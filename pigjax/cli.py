@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def _one_device_per_core() -> None:
-    """On a CPU, XLA runs loops on one core per device; `pigjax.bands` shares an image among them."""
+    """On a CPU, XLA runs loops on one core per device; images and simulations are shared among them."""
     import os
 
     import jax
@@ -89,6 +89,7 @@ def run(scene: Annotated[Path, typer.Argument(help="Scene file (.toml).")], out:
 
 
 def _run(path: Path, out: Path) -> None:
+    _one_device_per_core()
     from pigjax.scene import load_scene, run_scene
 
     scene = load_scene(path)

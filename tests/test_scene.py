@@ -184,17 +184,17 @@ def test_drawing_anew_simulates_nothing_and_another_scene_is_refused(finished, f
 def test_a_simulation_that_breaks_down_keeps_its_good_frames(folder, tmp_path, monkeypatch):
     import pigjax.scene.run as run_module
 
-    whole = run_module.rollout
+    whole = run_module.Fit.frame
 
-    def poisoned(particles, *args, **kwargs):
-        moved, trajectory, health = whole(particles, *args, **kwargs)
+    def poisoned(self, *args, **kwargs):
+        moved, trajectory, health = whole(self, *args, **kwargs)
         if poisoned.calls == 1:
             health = replace(health, nonfinite=jnp.asarray(3))
         poisoned.calls += 1
         return moved, trajectory, health
 
     poisoned.calls = 0
-    monkeypatch.setattr(run_module, "rollout", poisoned)
+    monkeypatch.setattr(run_module.Fit, "frame", poisoned)
     with pytest.raises(SimulationError, match=r"frame 2 of 3: 3 particles became NaN.*states up to frame 1 are kept"):
         run_scene(scene_from(values(), folder=folder), tmp_path)
     assert io.load_state(tmp_path / "states", 1)["x"].shape

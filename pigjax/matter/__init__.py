@@ -4,7 +4,7 @@ from pigjax.matter.chunks import State, tile_order, to_chunks, to_rows
 from pigjax.matter.config import SimConfig
 from pigjax.matter.groups import Group, Grouping, bound_visual, group_by_law
 from pigjax.matter.health import Health, StepHealth, perfect_health
-from pigjax.matter.state import WALL, Grid, Particles, Trajectory, fit_grid, make_particles
+from pigjax.matter.state import WALL, Grid, Particles, Trajectory, fit_grid, make_particles, vast_grid
 
 __all__ = [
     "WALL",
@@ -25,4 +25,5 @@ __all__ = [
     "tile_order",
     "to_chunks",
     "to_rows",
+    "vast_grid",
 ]

@@ -136,10 +136,10 @@ def _group(law, part, rows, table, grid, pieces):
     )
     F, rate = by_component(state.F.T), by_component(state.C.T)
     of_each = jax.tree.map(lambda p: p[own_row], parameters) if several else parameters
-    F, hardening, stress = respond(law, F, rate, 0.0, state.hardening[:, 0], of_each)
-    state = state._replace(
-        F=by_row(F).T, stress=by_row(stress).T, hardening=None if hardening is None or not kind.hardens else hardening[:, None]
-    )
+    inner = state.hardening[:, 0] if kind.hardens else None
+    F, inner, stress = respond(law, F, rate, 0.0, inner, of_each)
+    inner = None if inner is None else inner[:, None]
+    state = state._replace(F=by_row(F).T, stress=by_row(stress).T, hardening=inner)
     padding = -len(part) % pieces
     if padding:
         state = jax.tree.map(lambda rows: jnp.pad(rows, ((0, padding), (0, 0)), mode="edge"), state)

@@ -142,6 +142,15 @@ def fit_grid(x: Float[Array, "p 3"] | np.ndarray, dx: float, *, margin: float = 
     return Grid(jnp.asarray(low * dx, float), jnp.asarray(dx, float), (nx, ny, nz))
 
 
+def vast_grid(dx: float) -> Grid:
+    """A domain of a million cells a side around the world's origin, for matter that no wall holds.
+
+    Only what `rollout` visits of it is ever held, called outside of jit, grad and vmap.
+    """
+    nodes = 1 << 20
+    return Grid(jnp.full(3, -(nodes // 2) * dx), jnp.asarray(dx, float), (nodes,) * 3)
+
+
 def _round_up_size(nodes: int) -> int:
     sizes = (size << k for k in range(30) for size in (8, 12))
     return next(size for size in sizes if size >= nodes)

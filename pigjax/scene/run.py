@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from pigjax import io
+from pigjax.boxes import Fit, devices_for
 from pigjax.camera import Camera
 from pigjax.errors import SimulationError
-from pigjax.matter import Grid, Health, Particles, fit_grid
-from pigjax.mls_mpm import SimConfig, choose_substeps, rollout
+from pigjax.matter import Health, Particles, fit_grid, vast_grid
+from pigjax.mls_mpm import choose_substeps
 from pigjax.overlay import id_image, legend_sheet, overlay
 from pigjax.particles import deform
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, segment, signature
@@ -27,10 +27,8 @@ from pigjax.scene.schema import Scene
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, RenderConfig, render
 
-_MOST_NODES = 200_000_000
 _SHEET_FRAMES = 12
 Progress = Callable[[str, int, int], None]  # stage, done, of
-Shape = tuple[int, int, int]
 
 
 def run_scene(scene: Scene, out_dir: str | os.PathLike[str], *, progress: Progress | None = None) -> RunReport:
@@ -115,10 +113,10 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
     elif done < frames:
         saved, particles = io.load_pytree(checkpoint, (np.zeros((), np.int64), particles))
         done = int(saved)
-    dx = scene.simulation.dx
+    domain = vast_grid(scene.simulation.dx)
     substeps = choose_substeps(
         particles,
-        fit_grid(particles.x, dx),
+        fit_grid(particles.x, scene.simulation.dx),
         plan.table,
         plan.config,
         frames=max(frames - done, 1),
@@ -126,12 +124,24 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
         gravity=plan.gravity,
         colliders=plan.colliders,
     )
-    config = replace(plan.config, substeps=substeps)
+    fit = Fit()
     worst: list[Health] = []
-    shape = (0, 0, 0)
+    dtype = particles.x.dtype
     for frame in range(done + 1, frames + 1):
         tell("simulate", frame - 1, frames)
-        particles, health, shape = _one_frame(particles, plan, config, dx, shape)
+        particles, _, health = fit.frame(
+            particles,
+            domain,
+            plan.table,
+            plan.config,
+            devices_for(plan.config, len(particles)),
+            dt=jnp.asarray(plan.frame_dt / substeps, dtype),
+            gravity=jnp.asarray(plan.gravity, dtype),
+            colliders=plan.colliders,
+            start=jnp.asarray(plan.frame_dt * (frame - 1), dtype),
+            frames=1,
+            substeps=substeps,
+        )
         worst.append(health)
         if health.nonfinite > 0 or health.max_courant >= 1:
             raise SimulationError(
@@ -140,7 +150,7 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
             )
         _save(folder, frame, particles, key, checkpoint)
     tell("simulate", frames, frames)
-    report.sizes |= {"substeps_per_frame": substeps, "last_grid": shape, "resumed_from_frame": done}
+    report.sizes |= {"substeps_per_frame": substeps, "last_grid": fit.shape, "resumed_from_frame": done}
     if worst:
         report.health |= {
             "min_J": float(min(h.min_J for h in worst)),
@@ -159,46 +169,6 @@ def _save(folder: Path, frame: int, particles: Particles, key: str, checkpoint: 
     arrays = {"x": particles.x, "v": particles.v, "F_visual": particles.F_visual}
     io.save_state(folder, frame, {name: np.asarray(a) for name, a in arrays.items()}, signature=key)
     io.save_pytree(checkpoint, (np.asarray(frame), particles))
-
-
-def _one_frame(
-    particles: Particles, plan: Plan, config: SimConfig, dx: float, shape: Shape
-) -> tuple[Particles, Health, Shape]:
-    """One frame on a grid around where matter is and is heading; a wall that was met means a larger grid.
-
-    The grid keeps at least the `shape` of the last frame: another shape is another compilation.
-    """
-    slack = 2.0
-    while True:
-        grid = _grid_ahead(particles, plan, dx, slack, shape)
-        moved, _, health = rollout(
-            particles,
-            grid,
-            plan.table,
-            config,
-            frames=1,
-            frame_dt=plan.frame_dt,
-            gravity=jnp.asarray(plan.gravity, particles.x.dtype),
-            colliders=plan.colliders,
-        )
-        if health.escaped == 0:
-            return moved, health, grid.shape
-        slack *= 2
-
-
-def _grid_ahead(particles: Particles, plan: Plan, dx: float, slack: float, shape: Shape) -> Grid:
-    x, v = np.asarray(particles.x), np.asarray(particles.v)
-    ahead = x + v * plan.frame_dt + 0.5 * plan.gravity * plan.frame_dt**2
-    grid = fit_grid(np.concatenate([x, ahead]).astype(x.dtype), dx, margin=slack * dx)
-    nx, ny, nz = (max(sides) for sides in zip(grid.shape, shape))
-    shift = np.array([(a - b) // 2 for a, b in zip((nx, ny, nz), grid.shape)])
-    grid = Grid(grid.origin - shift * dx, grid.dx, (nx, ny, nz))
-    if (nodes := int(np.prod(grid.shape))) > _MOST_NODES:
-        raise SimulationError(
-            f"matter has spread so far that its grid needs {nodes:.2g} nodes (at most {_MOST_NODES:.2g});"
-            " catch what falls with a plane, or raise simulation.dx."
-        )
-    return grid
 
 
 def _draw(
