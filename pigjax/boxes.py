@@ -16,10 +16,11 @@ import numpy as np
 from pigjax.errors import SimulationError
 from pigjax.frames import Box, run_frames
 from pigjax.materials import MaterialTable
-from pigjax.matter import Grid, Health, Particles, SimConfig, Trajectory
+from pigjax.matter import Grid, Health, Particles, SimConfig, Trajectory, round_up_size
 
 _SMALL = 50_000  # nodes that need no box: less than other costs of a step
 _LARGEST = 200_000_000  # nodes
+_ROOM = 1.3  # a box is made so much longer than it must be: another size is another compilation
 _PER_DEVICE = 4096  # particles that are worth a device of their own
 
 
@@ -95,16 +96,19 @@ class Fit:
             cells = np.zeros((1, 3))
         low = np.floor(cells.min(0) - self.slack).astype(int) - 1
         high = np.ceil(cells.max(0) + self.slack).astype(int) + 1
-        shape = np.array([_round_up(n) for n in high - low + 1])
-        if np.prod(self.shape) <= 2 * np.prod(shape):
-            shape = np.maximum(shape, self.shape)
+        needed = high - low + 1
+        shape = np.array(self.shape)
+        wasteful = np.prod(shape) > max(8 * np.prod(needed), 4 * len(ahead))
+        if (needed > shape).any() or wasteful:
+            room = [round_up_size(int(n * _ROOM)) for n in needed]
+            shape = np.array(room) if wasteful else np.maximum(room, shape)
         shape = np.minimum(shape, sides)
         if (nodes := int(np.prod(shape))) > _LARGEST:
             raise SimulationError(
                 f"matter has spread so far that its grid needs {nodes:.2g} nodes (at most {_LARGEST:.2g}); catch what"
                 " falls with a plane, or take a coarser grid."
             )
-        low = np.clip(low - (shape - (high - low + 1)) // 2, 0, sides - shape)
+        low = np.clip(low - (shape - needed) // 2, 0, sides - shape)
         nx, ny, nz = map(int, shape)
         self.shape = nx, ny, nz
         origin = np.asarray(domain.origin, np.float64) + low * float(domain.dx)
@@ -117,12 +121,6 @@ def _ways(particles, duration, gravity):
     x, v = (np.asarray(a, np.float64) for a in (particles.x, particles.v))
     duration = float(duration)
     return np.concatenate([x, x + v * duration + 0.5 * np.asarray(gravity) * duration**2])
-
-
-def _round_up(nodes):
-    """Sides come in steps of an eighth or so, so that a box seldom changes its size."""
-    unit = max(4, 1 << (int(nodes - 1).bit_length() - 3))
-    return max(-(-nodes // unit) * unit, 8)
 
 
 def _worst(healths):
