@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.arrays import everywhere
 from pigjax.colliders import Collider
+from pigjax.implicit import balanced_velocity
 from pigjax.materials import MaterialTable
 from pigjax.matter import (
     Grid,
@@ -87,6 +88,10 @@ def run_frames(
         walls=config.walls,
         laws=tuple(group.law for group in grouping.groups),
         ruled=config.differentiation == "reverse",
+        balance=balanced_velocity if config.integrator == "implicit" else None,
+        newton_steps=config.newton_steps,
+        newton_tolerance=config.newton_tolerance,
+        krylov_steps=config.krylov_steps,
         axis=_AXIS if devices > 1 else None,
         fillers=sum(-len(part) % devices for part, moves in zip(grouping.parts, grouping.moves) if moves),
     )
@@ -156,7 +161,7 @@ def _counted(setting, watch, states):
         least, most = lax.pmin(least, setting.axis), lax.pmax(most, setting.axis)
         met = lax.pmax(met.astype(int), setting.axis) > 0
     escaped, inverted, gone = counts
-    health = StepHealth(least, most, escaped, gone - setting.fillers, inverted)
+    health = StepHealth(least, most, escaped, gone - setting.fillers, inverted, health.unconverged)
     return Watch(jax.tree.map(lax.stop_gradient, health), met)
 
 

@@ -27,12 +27,20 @@ Vector = Float[Array, "3"] | Sequence[float | int] | np.ndarray
 
 
 def stable_dt(
-    table: MaterialTable, grid: Grid, *, max_speed: Float[Array, ""] | float, cfl: float = 0.4
+    table: MaterialTable,
+    grid: Grid,
+    *,
+    max_speed: Float[Array, ""] | float,
+    cfl: float = 0.4,
+    integrator: str = "explicit",
 ) -> Float[Array, ""]:
-    """Longest stable explicit step [s] of matter that moves at up to max_speed [m/s].
+    """Longest stable step [s] of matter that moves at up to max_speed [m/s].
 
     No wave of the stiffest law crosses more than `cfl` cells, nor does viscous momentum diffuse too far for the grid.
+    Implicit steps only must not carry a particle over more than `cfl` cells.
     """
+    if integrator == "implicit":
+        return cfl * grid.dx / jnp.maximum(max_speed, jnp.finfo(grid.dx.dtype).tiny)
     advective = grid.dx / (table.wave_speed.max() + max_speed)
     viscous = grid.dx**2 / (4 * (table.explicit_viscosity / table.density).max())  # infinite without viscosity
     return cfl * jnp.minimum(advective, viscous)
@@ -58,7 +66,11 @@ def choose_substeps(
     height = float(grid.dx) * math.hypot(*grid.shape)
     speed = _max_speed(particles, colliders)
     speed = min(speed + fall * frames * duration, math.sqrt(speed**2 + 2 * fall * height))
-    needed = math.ceil(duration / float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl)) * (1 - 1e-6))
+    needed = math.ceil(
+        duration
+        / float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl, integrator=config.integrator))
+        * (1 - 1e-6)
+    )
     unit = 2 ** max(needed.bit_length() - 4, 0)
     return max(-(-needed // unit) * unit, 1)
 
@@ -173,7 +185,7 @@ def _check_table(particles, table):
 
 def _check_dt(dt, particles, grid, table, config, colliders):
     speed = _max_speed(particles, colliders)
-    limit = float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl))
+    limit = float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl, integrator=config.integrator))
     if dt > limit * (1 + 1e-5) and not config.force:
         raise InputError(
             f"dt = {dt:.4g} s is above the stable limit of {limit:.4g} s at cfl {config.cfl:g} and {speed:.3g} m/s:"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -37,6 +38,10 @@ class Setting(NamedTuple):
     walls: str
     laws: tuple[str, ...]  # that move
     ruled: bool  # reverse mode by the rules of `passes`
+    balance: Callable | None  # the implicit integrator, which finds the velocities that stresses balance
+    newton_steps: int
+    newton_tolerance: float
+    krylov_steps: int
     axis: str | None  # over which devices share the particles
     fillers: int  # particles without mass that even out the devices' shares
 
@@ -72,8 +77,12 @@ def advance(
     setting: Setting, scene: Scene, states: tuple[State, ...], time: Array, nothing: Watch
 ) -> tuple[tuple[State, ...], Watch]:
     """One step of all groups."""
-    velocity = _update_grid(setting, scene, _to_grid(setting, scene, states), time)
-    watch, moved = nothing, []
+    nodes = _to_grid(setting, scene, states)
+    if setting.balance is None:
+        velocity, converged = boundaries(setting, scene, free_velocity(scene, nodes)[1], time=time), True
+    else:
+        velocity, converged = setting.balance(setting, scene, states, nodes, time)
+    watch, moved = eqx.tree_at(lambda w: w.health.unconverged, nothing, jnp.asarray(converged) ^ True), []
     for law, parameters, state in zip(setting.laws, scene.parameters, states):
         take = Pass(partial(_take, setting, scene.grid.shape, law), setting.kernel, scene.grid.shape)
         shared = (scene.dt, scene.grid.dx, parameters)
@@ -84,7 +93,7 @@ def advance(
 
 
 def _to_grid(setting, scene, states):
-    """Mass and momentum of the nodes [nx ny nz 4], stress included."""
+    """Mass and momentum of the nodes [nx ny nz 4], with the impulse of the present stress in explicit steps."""
     give = Pass(partial(_give, setting, scene.grid.shape), setting.kernel, scene.grid.shape)
     shared = (scene.dt, scene.grid.dx)
     total: Array | float = 0.0
@@ -101,8 +110,10 @@ def _give(setting, shape, go, cells, chunk, shared):
     transfer = ruled_to_windows if setting.ruled else to_windows
 
     def affine(v, C, stress, mass, volume):
-        force = (-dt * setting.kernel.inverse_inertia / dx) * volume * by_component(stress)
-        return dx * mass * by_component(C) + force
+        kept = dx * mass * by_component(C)
+        if setting.balance is not None:
+            return kept
+        return kept - (dt * setting.kernel.inverse_inertia / dx) * volume * by_component(stress)
 
     distance = stage(go, lambda cells: distances(cells, setting.kernel, shape), cells)
     return transfer(setting.kernel, go, distance, mass[0], v, stage(go, affine, *chunk))
@@ -131,6 +142,7 @@ def _check(shape, state, volume, dt, dx):
             escaped=out.any((0, 1)).sum(),
             nonfinite=jnp.zeros((), int),
             inverted=(alive & (J <= 0)).sum(),
+            unconverged=jnp.zeros((), int),
         ),
         met=out.any(2),
     )
@@ -141,7 +153,7 @@ def _respond(law, state, v, per_cell, dt, dx, parameters):
     """State after the particles moved and their matter responded."""
     rate = per_cell / dx
     if state.row is not None:
-        parameters = _of_rows(parameters, state.row[0])
+        parameters = parameters_of(parameters, state.row[0])
     hardening = None if state.hardening is None else state.hardening[0]
     F, hardening, stress = respond(law, by_component(state.F), rate, dt, hardening, parameters)
     visual = state.visual
@@ -158,7 +170,7 @@ def _respond(law, state, v, per_cell, dt, dx, parameters):
     )
 
 
-def _of_rows(parameters, row):
+def parameters_of(parameters, row):
     """Parameters of each particle [c] from those of each material [m]; a sum whose transpose needs no scatter."""
     count = len(jax.tree.leaves(parameters)[0])
     return jax.tree.map(lambda p: sum(jnp.where(row == k, p[k], 0) for k in range(count)), parameters)
@@ -174,13 +186,21 @@ def _only_finite(state, shape):
     return jax.tree.map(lambda new, safe: jnp.where(ok, new, safe), state, rest)
 
 
-def _update_grid(setting, scene, nodes, time):
-    """Velocities of the nodes [nx ny nz 3] after gravity, colliders, stationary matter and walls."""
+def free_velocity(
+    scene: Scene, nodes: Float[Array, "x y z 4"]
+) -> tuple[Bool[Array, "x y z 1"], Float[Array, "x y z 3"]]:
+    """Which nodes have mass, and their velocities [m/s] under gravity, with nothing in the way."""
     mass = nodes[..., :1] / scene.unit_mass
     # Below this a node's mass squared, by which derivatives divide, leaves the range of floating point.
     filled = mass > jnp.finfo(mass.dtype).tiny ** 0.5
     velocity = nodes[..., 1:] / scene.unit_mass / jnp.where(filled, mass, 1.0) + scene.dt * scene.gravity
-    velocity = jnp.where(filled, velocity, 0.0)
+    return filled, jnp.where(filled, velocity, 0.0)
+
+
+def boundaries(
+    setting: Setting, scene: Scene, velocity: Float[Array, "x y z 3"], *, time: Array
+) -> Float[Array, "x y z 3"]:
+    """Velocities of the nodes after colliders, stationary matter and the walls of the domain."""
     for collider, contact in zip(scene.colliders, scene.contacts):
         contact = collider.contact(scene.grid.points, time) if contact is None else contact
         velocity = collider.apply(contact, velocity)

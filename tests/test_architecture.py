@@ -18,7 +18,8 @@ FLOORS = [
     {"tiles", "colliders", "transfers"},
     {"splat", "matter", "passes"},
     {"tile_walks", "clamp", "shells", "relocation", "starts", "overlay", "substep", "io"},
-    {"filling", "frames"},
+    {"filling", "implicit"},
+    {"frames"},
     {"boxes"},
     {"mls_mpm"},
     {"segmentation", "particles", "solids", "reconstruct", "pruning"},
@@ -29,7 +30,18 @@ FLOOR_OF = {module: floor for floor, modules in enumerate(FLOORS) for module in 
 # the two worlds meet in particles.py and solids.py only
 SPLATS = {"splat", "lists", "footprints", "chunks", "bands", "tiles", "tile_walks", "clamp", "segmentation"}
 SPLATS |= {"starts", "relocation", "reconstruct", "filling", "shells", "pruning"}
-MATTER = {"matter", "mls_mpm", "boxes", "frames", "substep", "passes", "transfers", "materials", "colliders"}
+MATTER = {
+    "matter",
+    "mls_mpm",
+    "boxes",
+    "frames",
+    "implicit",
+    "substep",
+    "passes",
+    "transfers",
+    "materials",
+    "colliders",
+}
 
 
 def imports_of(path):

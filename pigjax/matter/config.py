@@ -10,7 +10,7 @@ from pigjax.errors import InputError
 from pigjax.transfers import KERNELS
 
 _WALLS = ("separate", "slip", "sticky")
-_INTEGRATORS = ("explicit",)
+_INTEGRATORS = ("explicit", "implicit")
 _DIFFERENTIATION = ("reverse", "forward")
 
 
@@ -22,13 +22,16 @@ class SimConfig(eqx.Module):
     """
 
     kernel: str = static_field(default="quadratic")  # or "cubic": smoother, 2.4 times as many nodes
-    integrator: str = static_field(default="explicit")
+    integrator: str = static_field(default="explicit")  # or "implicit": steps that waves do not limit
     substeps: int | None = static_field(default=None)  # per frame; None: the fewest that are stable
     cfl: float = static_field(default=0.4)  # share of a cell that waves and particles cross in a step
     walls: str = static_field(default="separate")  # of the domain: "separate", "slip" or "sticky"
     visual_stretch: tuple[float, float] = static_field(default=(0.2, 5.0))  # bounds of F_visual's singular values
     force: bool = static_field(default=False)  # run steps longer than the stable limit
     stop: bool = static_field(default=False)  # at the first bad frame: the rest repeats the last good one
+    newton_steps: int = static_field(default=12)  # of an implicit step, at most
+    newton_tolerance: float = static_field(default=1e-3)  # momentum out of balance, relative to what drives the step
+    krylov_steps: int = static_field(default=300)  # of a Newton step, at most
     devices: int | None = static_field(default=None)  # that share the particles; None: all local ones, if it pays
     differentiation: str = static_field(default="reverse")  # or "forward": for jvp, jacfwd and hessian
     chunk: int | None = static_field(default=None)  # particles handled at once; None: 512 on a CPU, else all

@@ -18,6 +18,7 @@ class StepHealth(eqx.Module):
     escaped: Int[Array, ""]  # particles that the domain's wall had to hold back, most at one time
     nonfinite: Int[Array, ""]  # particles lost to NaN or infinity
     inverted: Int[Array, ""]  # particles turned inside out, most at one time
+    unconverged: Int[Array, ""]  # implicit steps whose balance was not found to SimConfig.newton_tolerance
 
     def is_bad(self) -> Bool[Array, ""]:
         """Whether anything is wrong."""
@@ -32,6 +33,8 @@ class StepHealth(eqx.Module):
         ]
         counted = [(int(count), what) for count, what in found]
         clauses = [f"{count} particle{'s' * (count != 1)} {what}" for count, what in counted if count]
+        if self.unconverged > 0:
+            clauses.append(f"{int(self.unconverged)} implicit steps did not converge")
         if self.max_courant >= 1:
             clauses.append(f"a particle moved {float(self.max_courant):.2g} cells in one step")
         return clauses
@@ -46,9 +49,10 @@ class StepHealth(eqx.Module):
             raise SimulationError(f"The simulation broke down: {', '.join(clauses)}{self._where()}; {_REMEDY}.")
 
     def worse(self, other: StepHealth) -> StepHealth:
-        """The worse of two, number by number."""
+        """The worse of two, number by number; unconverged steps add up."""
         merged = jax.tree.map(jnp.maximum, self, other)
-        return eqx.tree_at(lambda health: health.min_J, merged, jnp.minimum(self.min_J, other.min_J))
+        best = (jnp.minimum(self.min_J, other.min_J), self.unconverged + other.unconverged)
+        return eqx.tree_at(lambda health: (health.min_J, health.unconverged), merged, best)
 
     def _where(self) -> str:
         return ""
@@ -67,7 +71,7 @@ class Health(StepHealth):
 def perfect_health(dtype) -> StepHealth:
     """Health of no step at all, better than any other."""
     none = jnp.zeros((), int)
-    return StepHealth(jnp.full((), jnp.inf, dtype), jnp.zeros((), dtype), none, none, none)
+    return StepHealth(jnp.full((), jnp.inf, dtype), jnp.zeros((), dtype), none, none, none, none)
 
 
 _REMEDY = "take more substeps (or a lower cfl), a larger grid, or softer or slower matter"
