@@ -16,6 +16,7 @@ import numpy as np
 
 from pigjax import io
 from pigjax.camera import Camera
+from pigjax.colliders import Collider
 from pigjax.errors import SimulationError
 from pigjax.matter import Grid, Health, Particles, fit_grid
 from pigjax.mls_mpm import SimConfig, choose_substeps, rollout
@@ -131,7 +132,8 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
     shape = (0, 0, 0)
     for frame in range(done + 1, frames + 1):
         tell("simulate", frame - 1, frames)
-        particles, health, shape = _one_frame(particles, plan, config, dx, shape)
+        colliders = tuple(collider.after((frame - 1) * plan.frame_dt) for collider in plan.colliders)
+        particles, health, shape = _one_frame(particles, plan, colliders, config, dx, shape)
         worst.append(health)
         if health.nonfinite > 0 or health.max_courant >= 1:
             raise SimulationError(
@@ -162,7 +164,7 @@ def _save(folder: Path, frame: int, particles: Particles, key: str, checkpoint: 
 
 
 def _one_frame(
-    particles: Particles, plan: Plan, config: SimConfig, dx: float, shape: Shape
+    particles: Particles, plan: Plan, colliders: tuple[Collider, ...], config: SimConfig, dx: float, shape: Shape
 ) -> tuple[Particles, Health, Shape]:
     """One frame on a grid around where matter is and is heading; a wall that was met means a larger grid.
 
@@ -179,7 +181,7 @@ def _one_frame(
             frames=1,
             frame_dt=plan.frame_dt,
             gravity=jnp.asarray(plan.gravity, particles.x.dtype),
-            colliders=plan.colliders,
+            colliders=colliders,
         )
         if health.escaped == 0:
             return moved, health, grid.shape
