@@ -434,6 +434,7 @@ REFUSED = {
     "upper = .*: it must be above lower": lambda: Box((0.0, 0.0, 0.0), (1.0, 0.0, 1.0)),
     "lower = .*nan.* must be finite": lambda: Box((0.0, 0.0, math.nan), (1.0, 1.0, 1.0)),
     "dx = 0.0: the spacing": lambda: SampledDistance(np.ones((2, 2, 2)), (0.0, 0.0, 0.0), 0.0),
+    "samples = .*: two or more": lambda: SampledDistance(np.ones((2, 1, 2)), (0.0, 0.0, 0.0), 0.1),
     "samples = array of 8 .*finite": lambda: SampledDistance(np.full((2, 2, 2), math.nan), (0.0, 0.0, 0.0), 0.1),
     "rotation = .*: a quaternion must not be zero": lambda: SHAPES["box"](rotation=(0.0, 0.0, 0.0, 0.0)),
     "angular_velocity = .*inf.* must be finite": lambda: SHAPES["box"](angular_velocity=(0.0, math.inf, 0.0)),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -14,7 +16,7 @@ from pigjax.linalg import safe_norm
 class SampledDistance(Collider):
     """Any shape, by samples of its signed distance on a lattice; points beyond the lattice are outside.
 
-    Raises InputError where dx is not > 0 or a sample is not finite.
+    Raises InputError where dx is not > 0, a sample is not finite, or an axis has a single one.
     """
 
     samples: Float[Array, "nx ny nz"] = number()  # negative inside [m]
@@ -22,7 +24,8 @@ class SampledDistance(Collider):
     dx: Scalar = number()  # [m]
 
     def __check_init__(self):
-        self.require("dx", "the spacing of samples must be > 0 m", lambda dx: dx > 0)
+        self.require("dx", "the spacing of samples must be > 0 m", lambda dx: ~(dx <= 0))
+        self.require("samples", "two or more are needed along every axis", lambda v: min(v.shape[-3:]) >= 2)
 
     def shape_distance(self, points: Points) -> Float[Array, "*n"]:
         """By trilinear interpolation; beyond the lattice, at least the way to it."""
@@ -30,11 +33,11 @@ class SampledDistance(Collider):
         last = jnp.asarray(self.samples.shape) - 1
         low = jnp.clip(jnp.floor(lax.stop_gradient(cells)).astype(int), 0, last - 1)
         part = jnp.clip(cells - low, 0.0, 1.0)
-        total = jnp.zeros_like(cells[..., 0])
-        for corner in np.ndindex(2, 2, 2):
-            weight = jnp.where(jnp.asarray(corner), part, 1 - part).prod(-1)
-            index = low + jnp.asarray(corner)
-            total = total + weight * self.samples[index[..., 0], index[..., 1], index[..., 2]]
+        window = partial(lax.dynamic_slice, self.samples, slice_sizes=(2, 2, 2))
+        total = jax.vmap(window)(low.reshape(-1, 3)).reshape(*low.shape[:-1], 2, 2, 2)
+        for axis in (2, 1, 0):
+            share = part[(..., axis, *[None] * axis)]
+            total = (1 - share) * total[..., 0] + share * total[..., 1]
         beyond = safe_norm(jnp.maximum(-cells, 0.0) + jnp.maximum(cells - last, 0.0)) * self.dx
         return jnp.where(beyond > 0, jnp.maximum(total, 0.0) + beyond, total)
 
