@@ -7,7 +7,7 @@ one file.
 
 from pigjax.camera import Camera, interpolate_path, look_at, orbit, stack_cameras
 from pigjax.clamp import ClampParams, eigen_clamp
-from pigjax.colliders import Box, Plane, SampledDistance, Sphere
+from pigjax.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
 from pigjax.errors import InputError, MissingFileError, SceneError, SimulationError
 from pigjax.io import Views, load_gaussians, load_masks, load_ply, load_points, load_views, save_ply, write_video
 from pigjax.materials import Material, MaterialTable, material_table, preset
@@ -28,7 +28,9 @@ __version__ = "0.1.0"
 __all__ = [
     "Box",
     "Camera",
+    "Capsule",
     "ClampParams",
+    "Cylinder",
     "FitConfig",
     "Frame",
     "Gaussians",

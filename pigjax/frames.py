@@ -78,7 +78,7 @@ def run_frames(
         dt=dt,
         gravity=gravity,
         colliders=colliders,
-        contacts=tuple(c.contact(points) if c.velocity is None else None for c in colliders),
+        contacts=tuple(None if c.moves else c.contact(points) for c in colliders),
         frozen=None if still is None else touched_nodes(grid, still.x, kernel),
         unit_mass=lax.stop_gradient(particles.mass.max()),
         go=everywhere(particles.volume0[0] > -1),

@@ -26,7 +26,8 @@ from pigjax.substep import Scene, Setting, boundaries, free_velocity, parameters
 from pigjax.transfers import add_windows, distances, first_nodes, from_windows, stage, take_windows, to_windows
 
 _HALVINGS = 6  # of a Newton step that makes things worse
-_FORCING = 0.02  # residual of the Krylov solve of a Newton step, relative to its right-hand side
+_STALLED = 0.7  # share of the residual that a step must leave less of, for another to be worth it
+_FORCING = 0.05  # residual of the Krylov solve of a Newton step, relative to its right-hand side
 _EXACT = 1e-8  # the same where derivatives are wanted
 
 Nodes = Float[Array, "x y z 3"]
@@ -48,7 +49,8 @@ def balanced_velocity(
     mass = jnp.where(filled, nodes[..., :1], scene.unit_mass)
     smooth = scene._replace(colliders=tuple(map(_without_friction, scene.colliders)))
     limit = partial(boundaries, setting, smooth, time=time)
-    scale = lax.stop_gradient(mass + _stiffness(setting, scene, states))
+    stiffness = lax.stop_gradient(_stiffness(setting, scene, states))
+    scale = lax.stop_gradient(mass) + stiffness
     krylov = cg if all(LAWS[law].total for law in setting.laws) else bicgstab
 
     def force(v):
@@ -83,31 +85,37 @@ def balanced_velocity(
 
     def newton(function, start):
         drive = size(scene.dt * force(start)) + size(mass * (guess - start)) + size(scene.dt * mass * scene.gravity)
-        enough = setting.newton_tolerance * drive
+        rounding = jnp.finfo(start.dtype).eps * scene.grid.dx / scene.dt
+        enough = setting.newton_tolerance * drive + size(jnp.broadcast_to(rounding * stiffness, start.shape))
+
+        def unfinished(carry):
+            step, _, r, gain = carry
+            return ~everywhere((size(r) <= enough) | (gain > _STALLED) | (step >= setting.newton_steps))
 
         def improve(carry):
-            step, v, r, least = carry
-            v, r = _backtrack(function, size, v, direction(v, r), least)
-            return step + 1, v, r, size(r)
+            step, v, r, _ = carry
+            least = size(r)
+            v, r = _backtrack(function, size, v, r, direction(v, r))
+            return step + 1, v, r, size(r) / least
 
         r = function(start)
-        _, v, _, left = lax.while_loop(
-            lambda carry: ~everywhere((carry[3] <= enough) | (carry[0] >= setting.newton_steps)),
-            improve,
-            (jnp.zeros((), int), start, r, size(r)),
-        )
-        return v, (left <= enough)
+        _, v, r, _ = lax.while_loop(unfinished, improve, (jnp.zeros((), int), start, r, jnp.zeros((), start.dtype)))
+        return v, size(r) <= enough
 
     def tangent_solve(apply, right):
         exact = partial(solve, tolerance=_EXACT, method=bicgstab)
         return lax.custom_linear_solve(apply, right, exact, transpose_solve=exact)
 
     v, converged = lax.custom_root(residual, limit(guess), newton, tangent_solve, has_aux=True)
-    return boundaries(setting, scene, pushed(v), time=time), converged
+    # what is in the way meets the impulse that v would not bear; in free directions its rounding is not let in
+    way = pushed(v)
+    _, free = jax.linearize(limit, way)
+    return boundaries(setting, scene, v + (way - v) - free(way - v), time=time), converged
 
 
-def _backtrack(function, size, start, direction, least):
-    """The longest of halved steps that lessens the residual."""
+def _backtrack(function, size, start, r, direction):
+    """The longest of halved steps that lessens the residual r, or none."""
+    least = size(r)
 
     def too_far(carry):
         halvings, _, r = carry
@@ -115,12 +123,13 @@ def _backtrack(function, size, start, direction, least):
 
     def halve(carry):
         halvings, _, _ = carry
-        change = start + direction * 0.5 ** (halvings + 1.0)
-        return halvings + 1, change, function(change)
+        v = start + direction * 0.5 ** (halvings + 1.0)
+        return halvings + 1, v, function(v)
 
-    change = start + direction
-    _, change, r = lax.while_loop(too_far, halve, (jnp.zeros((), int), change, function(change)))
-    return change, r
+    v = start + direction
+    _, v, new = lax.while_loop(too_far, halve, (jnp.zeros((), int), v, function(v)))
+    better = size(new) < least
+    return jnp.where(better, v, start), jnp.where(better, new, r)
 
 
 def _forces(setting, scene, states, v):

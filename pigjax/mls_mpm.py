@@ -64,7 +64,7 @@ def choose_substeps(
     """
     fall, duration = float(np.linalg.norm(gravity)), float(frame_dt)
     height = float(grid.dx) * math.hypot(*grid.shape)
-    speed = _max_speed(particles, colliders)
+    speed = _max_speed(particles, colliders, grid, frames * duration)
     speed = min(speed + fall * frames * duration, math.sqrt(speed**2 + 2 * fall * height))
     needed = math.ceil(
         duration
@@ -170,9 +170,11 @@ def _is_traced(*trees: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
-def _max_speed(particles, colliders):
+def _max_speed(particles, colliders, grid, duration):
     speeds = np.linalg.norm(np.asarray(particles.v), axis=-1)
-    own = [float(np.linalg.norm(c.velocity)) for c in colliders if c.velocity is not None]
+    ends = np.array(list(np.ndindex(2, 2, 2))) * (np.array(grid.shape) - 1)
+    corners = jnp.asarray(grid.origin + grid.dx * ends)
+    own = [float(c.top_speed(corners, duration)) for c in colliders if c.moves]
     return max([float(np.max(speeds, where=np.isfinite(speeds), initial=0.0)), *own])
 
 
@@ -184,7 +186,7 @@ def _check_table(particles, table):
 
 
 def _check_dt(dt, particles, grid, table, config, colliders):
-    speed = _max_speed(particles, colliders)
+    speed = _max_speed(particles, colliders, grid, dt)
     limit = float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl, integrator=config.integrator))
     if dt > limit * (1 + 1e-5) and not config.force:
         raise InputError(

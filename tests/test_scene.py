@@ -67,6 +67,35 @@ BAD = {
         values(objects__ball={"material": "jelly", "velocity": [1, 2]}),
         r"velocity: expected `array` of length 3",
     ),
+    "unknown collider field": (
+        values(spheres__ball={"centre": [0, 0, 0], "radius": 1.0, "spin": 2.0}),
+        r"spheres\.ball\.spin: unknown field; choose one of friction, .*radius",
+    ),
+    "misspelt collider field": (
+        values(cylinders__disc={"start": [0, 0, 0], "end": [0, 0, 1], "radius": 1.0, "angular_velocty": [0, 0, 1]}),
+        r"cylinders\.disc\.angular_velocty.*'angular_velocity'",
+    ),
+    "no radius": (values(capsules__rod={"start": [0, 0, 0], "end": [0, 0, 1]}), r"capsules.*missing.*`radius`"),
+    "zero radius": (
+        values(capsules__rod={"start": [0, 0, 0], "end": [0, 0, 1], "radius": 0}),
+        r"capsules\.rod\.radius = 0\.0: it must be > 0 m",
+    ),
+    "zero normal": (
+        values(planes__floor={"point": [0, 0, 0], "normal": [0, 0, 0]}),
+        r"planes\.floor\.normal = .* zero",
+    ),
+    "endless spin": (
+        values(boxes__crate={"lower": [0, 0, 0], "upper": [1, 1, 1], "angular_velocity": [0, 0, float("inf")]}),
+        r"boxes\.crate\.angular_velocity = .*inf.*must be finite",
+    ),
+    "negative friction": (
+        values(spheres__ball={"centre": [0, 0, 0], "radius": 1.0, "friction": -0.5}),
+        r"spheres\.ball\.friction = -0\.5",
+    ),
+    "unknown mode": (
+        values(spheres__ball={"centre": [0, 0, 0], "radius": 1.0, "mode": "bounce"}),
+        r"spheres.*mode: invalid enum value 'bounce'",
+    ),
 }
 
 
@@ -92,6 +121,28 @@ def test_the_bundled_scene_is_valid_and_moves_five_materials():
     assert len(moving) >= 5
     assert len({entry.material or entry.model for entry in moving}) >= 5
     assert scene.objects["table"].fixed
+
+
+def test_a_scene_places_and_moves_every_kind_of_collider():
+    rod = {"start": [0, 0, 0], "end": [0, 0, 1], "radius": 0.1}
+    scene = scene_from(
+        values(
+            boxes__crate={"lower": [0, 0, 0], "upper": [1, 1, 1], "rotation": [1, 0, 0, 1], "pivot": [0, 0, 0]},
+            spheres__wheel={"centre": [0, 0, 1], "radius": 0.5, "angular_velocity": [0, 2, 0], "velocity": [1, 0, 0]},
+            capsules__rod={**rod, "mode": "slip"},
+            cylinders__drum={**rod, "mode": "sticky", "friction": 0.1},
+        )
+    )
+    plane, crate, wheel, capsule, drum = scene.colliders()
+    assert [type(c).__name__ for c in (plane, crate, wheel, capsule, drum)] == [
+        "Plane", "Box", "Sphere", "Capsule", "Cylinder",
+    ]  # fmt: skip
+    assert float(crate.distance(jnp.asarray([[-0.5, 0.5, 0.5]]))[0]) == pytest.approx(-0.5)  # a quarter turn about z
+    np.testing.assert_allclose(wheel.contact(jnp.asarray([[1.0, 0.0, 1.2]]), 1.0).velocity, [[1.4, 0, 0]], atol=1e-6)
+    assert [c.moves for c in (plane, crate, wheel, capsule, drum)] == [False, False, True, False, False]
+    assert (capsule.mode, drum.mode, float(capsule.friction), float(drum.friction)) == (
+        "slip", "sticky", 0.5, pytest.approx(0.1),
+    )  # fmt: skip
 
 
 def ball(count=400, seed=0):
@@ -199,6 +250,23 @@ def test_a_simulation_that_breaks_down_keeps_its_good_frames(folder, tmp_path, m
         run_scene(scene_from(values(), folder=folder), tmp_path)
     assert io.load_state(tmp_path / "states", 1)["x"].shape
     assert (tmp_path / "report.json").exists()
+
+
+def test_colliders_move_on_from_frame_to_frame(folder, tmp_path, monkeypatch):
+    import pigjax.scene.run as run_module
+
+    whole, starts = run_module.Fit.frame, []
+
+    def watched(self, *args, start, **kwargs):
+        starts.append(float(start))
+        moved, trajectory, health = whole(self, *args, start=start, **kwargs)
+        return moved, trajectory, replace(health, nonfinite=jnp.asarray(int(len(starts) == 3)))
+
+    monkeypatch.setattr(run_module.Fit, "frame", watched)
+    lift = {"point": [0, 0, -1], "normal": [0, 0, 1], "velocity": [0, 0, 0.1]}
+    with pytest.raises(SimulationError):
+        run_scene(scene_from(values(planes__lift=lift), folder=folder), tmp_path)
+    np.testing.assert_allclose(starts, [0, 1 / 30, 2 / 30], atol=1e-6)
 
 
 def test_report_and_scene_round_trip_as_plain_values(finished):

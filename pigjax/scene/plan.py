@@ -15,7 +15,7 @@ from jaxtyping import Float
 from pigjax import io
 from pigjax.camera import Camera, orbit, stack_cameras
 from pigjax.clamp import ClampParams
-from pigjax.colliders import Box, Collider, Plane
+from pigjax.colliders import Collider
 from pigjax.errors import SceneError
 from pigjax.materials import Material, MaterialTable
 from pigjax.matter import Particles
@@ -125,7 +125,7 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
     labels = _without_buried(inputs, labels, solids, spec.dx)
     moving = {name: entry for name, entry in scene.objects.items() if not entry.fixed}
     materials: dict[int, Material] = {inputs.ids[name]: entry.to_material(name) for name, entry in moving.items()}
-    colliders = (*solids.values(), *_named_colliders(scene))
+    colliders = (*solids.values(), *scene.colliders())
     particles, table = seed_particles(
         inputs.gaussians,
         labels,
@@ -187,17 +187,6 @@ def _without_buried(inputs: Inputs, labels: Labels, solids: dict[str, Collider],
         buried = solid.distance(inputs.gaussians.means) < -0.25 * dx
         labels = replace(labels, object_id=jnp.where(buried, inputs.ids[name], labels.object_id))
     return labels
-
-
-def _named_colliders(scene: Scene) -> tuple[Collider, ...]:
-    colliders: list[Collider] = []
-    for plane in scene.planes.values():
-        point, normal, friction = map(jnp.asarray, (plane.point, plane.normal, plane.friction))
-        colliders.append(Plane(point=point, normal=normal, friction=friction, mode=plane.mode))
-    for box in scene.boxes.values():
-        lower, upper, friction = map(jnp.asarray, (box.lower, box.upper, box.friction))
-        colliders.append(Box(lower=lower, upper=upper, friction=friction, mode=box.mode))
-    return tuple(colliders)
 
 
 def _axis(name: str) -> Float[np.ndarray, "3"]:

@@ -7,11 +7,13 @@ import re
 import tomllib
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import msgspec
 from msgspec import Struct
+from msgspec.structs import asdict
 
+from pigjax.colliders import Box, Capsule, Collider, Cylinder, Plane, Sphere
 from pigjax.errors import InputError, MissingFileError, SceneError
 from pigjax.materials import PRESETS, Material, Parameters
 
@@ -127,22 +129,69 @@ class ObjectSpec(Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
             raise SceneError(f"objects.{name}.{error}") from None
 
 
-class PlaneSpec(Struct, forbid_unknown_fields=True, frozen=True):
+class ColliderSpec(Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """What all colliders may say: how they touch, stand and move; the numbers of `Collider`."""
+
+    friction: float = 0.5
+    mode: Literal["sticky", "slip", "separate"] = "separate"
+    velocity: Triple | None = None  # [m/s]
+    angular_velocity: Triple | None = None  # [rad/s]
+    rotation: tuple[float, float, float, float] | None = None  # quaternion wxyz
+    pivot: Triple | None = None  # what it turns about [m]; None: its middle
+    shape: ClassVar[type[Collider]]
+
+    def to_collider(self, where: str) -> Collider:
+        """The collider that it says.
+
+        Raises:
+            SceneError: a number is out of range.
+        """
+        try:
+            return self.shape(**{name: value for name, value in asdict(self).items() if value is not None})
+        except InputError as error:
+            raise SceneError(f"{where}.{error}") from None
+
+
+class PlaneSpec(ColliderSpec, frozen=True, kw_only=True):
     """A half space that matter cannot enter."""
 
     point: Triple  # [m]
     normal: Triple
-    friction: float = 0.5
-    mode: Literal["sticky", "slip", "separate"] = "separate"
+    shape = Plane
 
 
-class BoxSpec(Struct, forbid_unknown_fields=True, frozen=True):
-    """A solid box along the axes."""
+class BoxSpec(ColliderSpec, frozen=True, kw_only=True):
+    """A solid box, along the axes unless turned."""
 
     lower: Triple  # [m]
     upper: Triple
-    friction: float = 0.5
-    mode: Literal["sticky", "slip", "separate"] = "separate"
+    shape = Box
+
+
+class SphereSpec(ColliderSpec, frozen=True, kw_only=True):
+    """A solid ball."""
+
+    centre: Triple  # [m]
+    radius: float
+    shape = Sphere
+
+
+class CapsuleSpec(ColliderSpec, frozen=True, kw_only=True):
+    """A solid rod with round ends about two points of its axis."""
+
+    start: Triple  # [m]
+    end: Triple
+    radius: float
+    shape = Capsule
+
+
+class CylinderSpec(ColliderSpec, frozen=True, kw_only=True):
+    """A solid cylinder with flat ends in two points of its axis."""
+
+    start: Triple  # [m]
+    end: Triple
+    radius: float
+    shape = Cylinder
 
 
 class Scene(Struct, forbid_unknown_fields=True, frozen=True):
@@ -156,11 +205,34 @@ class Scene(Struct, forbid_unknown_fields=True, frozen=True):
     camera: CameraSpec = CameraSpec()
     planes: dict[str, PlaneSpec] = {}
     boxes: dict[str, BoxSpec] = {}
+    spheres: dict[str, SphereSpec] = {}
+    capsules: dict[str, CapsuleSpec] = {}
+    cylinders: dict[str, CylinderSpec] = {}
     folder: str = "."  # set by `load_scene`; what relative paths start from
 
     def path(self, name: str) -> Path:
         """A path of the file, seen from the working directory."""
         return Path(self.folder) / name
+
+    def colliders(self) -> tuple[Collider, ...]:
+        """Those that it describes by numbers.
+
+        Raises:
+            SceneError: a number is out of range.
+        """
+        sections = {section: getattr(self, section) for section in _COLLIDERS}
+        return tuple(
+            spec.to_collider(f"{section}.{name}") for section, specs in sections.items() for name, spec in specs.items()
+        )
+
+
+_COLLIDERS = {
+    "planes": PlaneSpec,
+    "boxes": BoxSpec,
+    "spheres": SphereSpec,
+    "capsules": CapsuleSpec,
+    "cylinders": CylinderSpec,
+}
 
 
 def load_scene(path: str | Path) -> Scene:
@@ -218,6 +290,7 @@ def _check(scene: Scene, where: str) -> None:
     for name, spec in scene.objects.items():
         if spec.fixed and (spec.material or spec.model):
             raise SceneError(f"{where}: objects.{name}: a fixed object has no material; remove one of the two.")
+    scene.colliders()
 
 
 def _explain(message: str, values: dict[str, Any]) -> str:
@@ -230,14 +303,14 @@ def _explain(message: str, values: dict[str, Any]) -> str:
         return f"{at or 'top level'}: {message[0].lower()}{message[1:]}."
     name = unknown.group(1)
     known = _fields_at(at)
-    if at.split(".")[0] in ("objects", "planes", "boxes"):
+    if at.split(".")[0] in ("objects", *_COLLIDERS):
         table = values.get(at.split(".")[0], {})
         at = next((f"{at}.{key}" for key, entry in table.items() if isinstance(entry, dict) and name in entry), at)
     return f"{at + '.' if at else ''}{name}: unknown field; {_suggest(name, known)}."
 
 
 def _fields_at(place: str) -> tuple[str, ...]:
-    structs = {"": Scene, "objects": ObjectSpec, "planes": PlaneSpec, "boxes": BoxSpec}
+    structs = {"": Scene, "objects": ObjectSpec, **_COLLIDERS}
     structs |= {"input": InputSpec, "segmentation": SegmentationSpec, "simulation": SimulationSpec}
     structs |= {"clamp": ClampSpec, "camera": CameraSpec}
     fields = structs.get(place.split(".")[0], Scene).__struct_fields__
