@@ -8,12 +8,13 @@ one file.
 from pigjax.camera import Camera, interpolate_path, look_at, orbit, stack_cameras
 from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
+from pigjax.contact import BodyContact
 from pigjax.errors import InputError, MissingFileError, SceneError, SimulationError
 from pigjax.io import Views, load_gaussians, load_masks, load_ply, load_points, load_views, save_ply, write_video
 from pigjax.materials import Material, MaterialTable, material_table, preset
-from pigjax.matter import Grid, Health, Particles, Trajectory, fit_grid, make_particles
+from pigjax.matter import Grid, Health, Particles, Trajectory, fit_grid, make_particles, vast_grid
 from pigjax.metrics import boundary_iou, mean_iou, psnr, ssim
-from pigjax.mls_mpm import SimConfig, choose_substeps, rollout, stable_dt, step
+from pigjax.mls_mpm import SimConfig, choose_integrator, choose_substeps, rollout, stable_dt, step
 from pigjax.particles import at_frame, bind, deform, seed_particles
 from pigjax.pruning import contributions, prune
 from pigjax.reconstruct import FitConfig, reconstruct
@@ -26,6 +27,7 @@ __version__ = "0.1.0"
 
 
 __all__ = [
+    "BodyContact",
     "Box",
     "Camera",
     "Capsule",
@@ -57,6 +59,7 @@ __all__ = [
     "at_frame",
     "bind",
     "boundary_iou",
+    "choose_integrator",
     "choose_substeps",
     "collider_from_gaussians",
     "contributions",
@@ -93,5 +96,6 @@ __all__ = [
     "stack_cameras",
     "step",
     "surface_depth",
+    "vast_grid",
     "write_video",
 ]

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.arrays import everywhere
 from pigjax.colliders import Collider
+from pigjax.contact import BodyContact
 from pigjax.implicit import balanced_velocity
 from pigjax.materials import MaterialTable
 from pigjax.matter import (
@@ -56,6 +57,7 @@ def run_frames(
     dt: Float[Array, ""],
     gravity: Float[Array, "3"],
     colliders: tuple[Collider, ...],
+    contact: BodyContact | None,
     start: Float[Array, ""],
     frames: int,
     substeps: int,
@@ -63,10 +65,11 @@ def run_frames(
     """Simulate from a time `start` [s] after the colliders were where they say; also tells the sides that were met."""
     kernel, dtype = KERNELS[config.kernel], particles.x.dtype
     grid = box.grid
-    grouping = group_by_law(particles, table, grid, devices)
-    states = grouping.states
+    grouping = group_by_law(particles, table, grid, devices, apart=contact is not None)
+    states, bodies = grouping.states, 1 if contact is None else contact.bodies
+    nodes = (bodies * grid.shape[0], *grid.shape[1:])
     # neighbours beside each other: in the cache, and on the same device
-    orders = [tile_order(state.cells, grid.shape) for state in states]
+    orders = [tile_order(state.cells, nodes) for state in states]
     states = tuple(_take(state, order) for state, order in zip(states, orders))
     points = grid.points
     still = grouping.still
@@ -79,6 +82,8 @@ def run_frames(
         gravity=gravity,
         colliders=colliders,
         contacts=tuple(None if c.moves else c.contact(points) for c in colliders),
+        contact=contact,
+        specific_volume=None if contact is None else _specific_volume(particles, contact.bodies) / grid.dx**3,
         frozen=None if still is None else touched_nodes(grid, still.x, kernel),
         unit_mass=lax.stop_gradient(particles.mass.max()),
         go=everywhere(particles.volume0[0] > -1),
@@ -152,6 +157,7 @@ def _frames(setting, config, frames, substeps, scene, states, start, nothing):
 
 def _counted(setting, watch, states):
     """The health of all devices, with the particles that are not finite."""
+    watch, states = jax.tree.map(lax.stop_gradient, (watch, states))
     health = watch.health
     gone = sum((state.volume <= 0).sum() for state in states)
     counts = jnp.stack([health.escaped, health.inverted, gone])
@@ -162,7 +168,14 @@ def _counted(setting, watch, states):
         met = lax.pmax(met.astype(int), setting.axis) > 0
     escaped, inverted, gone = counts
     health = StepHealth(least, most, escaped, gone - setting.fillers, inverted, health.unconverged)
-    return Watch(jax.tree.map(lax.stop_gradient, health), met)
+    return Watch(health, met)
+
+
+def _specific_volume(particles, bodies):
+    volume, mass = (
+        jax.ops.segment_sum(values, particles.body, bodies) for values in (particles.volume0, particles.mass)
+    )
+    return volume / jnp.where(mass > 0, mass, 1.0)
 
 
 def _block_length(substeps, frames):

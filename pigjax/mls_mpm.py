@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -17,12 +18,14 @@ from jaxtyping import Array, Float
 
 from pigjax.boxes import devices_for, run_in_boxes, whole
 from pigjax.colliders import Collider
+from pigjax.contact import BodyContact
 from pigjax.errors import InputError
 from pigjax.frames import run_frames
 from pigjax.materials import MaterialTable
 from pigjax.matter import Grid, Health, Particles, SimConfig, StepHealth, Trajectory
 
-__all__ = ["SimConfig", "choose_substeps", "rollout", "stable_dt", "step"]
+__all__ = ["SimConfig", "choose_integrator", "choose_substeps", "rollout", "stable_dt", "step"]
+_COST_OF_IMPLICIT = 500  # explicit steps in the time of an implicit one, by benchmarks/bench_implicit.py
 Vector = Float[Array, "3"] | Sequence[float | int] | np.ndarray
 
 
@@ -44,6 +47,20 @@ def stable_dt(
     advective = grid.dx / (table.wave_speed.max() + max_speed)
     viscous = grid.dx**2 / (4 * (table.explicit_viscosity / table.density).max())  # infinite without viscosity
     return cfl * jnp.minimum(advective, viscous)
+
+
+def choose_integrator(
+    particles: Particles, grid: Grid, table: MaterialTable, config: SimConfig, **steps: Any
+) -> SimConfig:
+    """The settings with integrator "auto" decided (host): implicit where it saves more steps than one of its costs.
+
+    `steps` are the other arguments of `choose_substeps`.
+    """
+    if config.integrator != "auto":
+        return config
+    explicit, implicit = (replace(config, integrator=name) for name in ("explicit", "implicit"))
+    needed = [choose_substeps(particles, grid, table, choice, **steps) for choice in (explicit, implicit)]
+    return implicit if needed[0] > _COST_OF_IMPLICIT * needed[1] else explicit
 
 
 def choose_substeps(
@@ -84,6 +101,7 @@ def step(
     *,
     gravity: Vector,
     colliders: tuple[Collider, ...] = (),
+    contact: BodyContact | None = None,
 ) -> tuple[Particles, StepHealth]:
     """One explicit step of dt [s] under gravity [m/s²]: particles to grid, grid update, grid to particles.
 
@@ -93,9 +111,10 @@ def step(
         InputError: dt is above `stable_dt` (seen outside of jit only, and unless `config.force`).
     """
     _check_table(particles, table)
-    if not _is_traced(particles, grid, table, dt, gravity, colliders):
+    _check_contact(particles, config, contact)
+    if not _is_traced(particles, grid, table, dt, gravity, colliders, contact):
         _check_dt(float(dt), particles, grid, table, config, colliders)
-    end, _, health = _on_whole_grid(particles, grid, table, config, dt, gravity, colliders, frames=1, substeps=1)
+    end, _, health = _on_whole_grid(particles, grid, table, config, dt, (gravity, colliders, contact), 1, 1)
     return end, health
 
 
@@ -109,6 +128,7 @@ def rollout(
     frame_dt: Float[Array, ""] | float,
     gravity: Vector,
     colliders: tuple[Collider, ...] = (),
+    contact: BodyContact | None = None,
 ) -> tuple[Particles, Trajectory, Health]:
     """Simulate `frames` frames of frame_dt [s] each under gravity [m/s²].
 
@@ -122,29 +142,41 @@ def rollout(
         SimulationError: matter has spread so far that its grid would not fit into memory (outside of those only).
     """
     _check_table(particles, table)
+    _check_contact(particles, config, contact)
     substeps = config.substeps
-    if _is_traced(particles, grid, table, frame_dt, gravity, colliders):
+    steps: dict[str, Any] = {"frames": frames, "frame_dt": frame_dt, "gravity": gravity, "colliders": colliders}
+    if _is_traced(particles, grid, table, frame_dt, gravity, colliders, contact):
         if substeps is None:
             raise InputError(
                 "rollout is traced by jit, grad or vmap and cannot choose its substeps: give SimConfig(substeps=...);"
                 " choose_substeps finds the number from concrete values."
             )
         dt = jnp.asarray(frame_dt) / substeps
-        return _on_whole_grid(particles, grid, table, config, dt, gravity, colliders, frames=frames, substeps=substeps)
+        return _on_whole_grid(particles, grid, table, config, dt, (gravity, colliders, contact), frames, substeps)
+    config = choose_integrator(particles, grid, table, config, **steps)
     if substeps is None:
-        substeps = choose_substeps(
-            particles, grid, table, config, frames=frames, frame_dt=frame_dt, gravity=gravity, colliders=colliders
-        )
+        substeps = choose_substeps(particles, grid, table, config, **steps)
     _check_dt(float(frame_dt) / substeps, particles, grid, table, config, colliders)
     dt = _like(frame_dt, particles) / substeps
-    grid, table, gravity, colliders = _like((grid, table, jnp.asarray(gravity), colliders), particles)
+    shared = _like((grid, table, jnp.asarray(gravity), colliders, contact), particles)
+    grid, table, gravity, colliders, contact = shared
     return run_in_boxes(
-        particles, grid, table, config, frames=frames, dt=dt, gravity=gravity, colliders=colliders, substeps=substeps
+        particles,
+        grid,
+        table,
+        config,
+        frames=frames,
+        dt=dt,
+        gravity=gravity,
+        colliders=colliders,
+        contact=contact,
+        substeps=substeps,
     )
 
 
-def _on_whole_grid(particles, grid, table, config, dt, gravity, colliders, *, frames, substeps):
-    dt, gravity, colliders = _like((dt, jnp.asarray(gravity), colliders), particles)
+def _on_whole_grid(particles, grid, table, config, dt, around, frames, substeps):
+    gravity, colliders, contact = around
+    dt, gravity, colliders, contact = _like((dt, jnp.asarray(gravity), colliders, contact), particles)
     grid, table = _like((grid, table), particles)
     return run_frames(
         particles,
@@ -155,6 +187,7 @@ def _on_whole_grid(particles, grid, table, config, dt, gravity, colliders, *, fr
         dt=dt,
         gravity=gravity,
         colliders=colliders,
+        contact=contact,
         start=jnp.zeros_like(dt),
         frames=frames,
         substeps=substeps,
@@ -183,6 +216,21 @@ def _check_table(particles, table):
         raise InputError(
             f"The material table has {len(table)} rows, the particles were made for one of {len(particles.counts)}."
         )
+
+
+def _check_contact(particles, config, contact):
+    if contact is None:
+        return
+    if config.integrator != "explicit":
+        raise InputError(
+            f"SimConfig.integrator = {config.integrator!r} knows no contact between bodies: use 'explicit' steps, or"
+            " contact=None."
+        )
+    if not isinstance(particles.body, jax.core.Tracer):
+        low, high = int(particles.body.min()), int(particles.body.max())
+        if low < 0 or high >= contact.bodies:
+            bad = low if low < 0 else high
+            raise InputError(f"Particles.body = {bad}: BodyContact has bodies 0 to {contact.bodies - 1}.")
 
 
 def _check_dt(dt, particles, grid, table, config, colliders):

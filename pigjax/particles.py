@@ -108,6 +108,7 @@ def seed_particles(
         material=rows,
         velocity=velocity,
         gaussian=carried,
+        body=rows,
     )
     return particles, table
 

@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.colliders import Collider, Contact
+from pigjax.contact import BodyContact
 from pigjax.materials import Parameters, respond
 from pigjax.materials.tensors import determinant, product
 from pigjax.matter import WALL, Grid, State, StepHealth
@@ -57,9 +58,22 @@ class Scene(NamedTuple):
     gravity: Float[Array, "3"]
     colliders: tuple[Collider, ...]
     contacts: tuple[Contact | None, ...]  # of the colliders that do not move
+    contact: BodyContact | None  # between bodies, each of which has a grid of its own beside the others
+    specific_volume: Float[Array, "b"] | None  # of each body, on average [cells/kg]
     frozen: Bool[Array, "nx ny nz"] | None  # nodes that stationary matter touches
     unit_mass: Float[Array, ""]  # of the heaviest particle [kg]
     go: Bool[Array, ""]  # for `transfers.stage`
+
+    @property
+    def bodies(self) -> int:
+        """Grids side by side."""
+        return 1 if self.contact is None else self.contact.bodies
+
+    @property
+    def nodes(self) -> tuple[int, int, int]:
+        """Nodes of all grids: those of the bodies stand behind each other along x."""
+        nx, ny, nz = self.grid.shape
+        return self.bodies * nx, ny, nz
 
 
 class Watch(eqx.Module):
@@ -79,12 +93,15 @@ def advance(
     """One step of all groups."""
     nodes = _to_grid(setting, scene, states)
     if setting.balance is None:
-        velocity, converged = boundaries(setting, scene, free_velocity(scene, nodes)[1], time=time), True
+        _, velocity = free_velocity(scene, nodes)
+        if scene.contact is not None:
+            velocity = _part_bodies(setting, scene, states, nodes, velocity)
+        velocity, converged = boundaries(setting, scene, velocity, time=time), True
     else:
         velocity, converged = setting.balance(setting, scene, states, nodes, time)
     watch, moved = eqx.tree_at(lambda w: w.health.unconverged, nothing, jnp.asarray(converged) ^ True), []
     for law, parameters, state in zip(setting.laws, scene.parameters, states):
-        take = Pass(partial(_take, setting, scene.grid.shape, law), setting.kernel, scene.grid.shape)
+        take = Pass(partial(_take, setting, scene.nodes, scene.bodies, law), setting.kernel, scene.nodes)
         shared = (scene.dt, scene.grid.dx, parameters)
         state, own = gather_chunks(take, scene.go, velocity, state, shared, nothing, ruled=setting.ruled)
         moved.append(state)
@@ -94,7 +111,7 @@ def advance(
 
 def _to_grid(setting, scene, states):
     """Mass and momentum of the nodes [nx ny nz 4], with the impulse of the present stress in explicit steps."""
-    give = Pass(partial(_give, setting, scene.grid.shape), setting.kernel, scene.grid.shape)
+    give = Pass(partial(_give, setting, scene.nodes), setting.kernel, scene.nodes)
     shared = (scene.dt, scene.grid.dx)
     total: Array | float = 0.0
     for state in states:
@@ -119,19 +136,25 @@ def _give(setting, shape, go, cells, chunk, shared):
     return transfer(setting.kernel, go, distance, mass[0], v, stage(go, affine, *chunk))
 
 
-def _take(setting, shape, law, go, windows, state, shared):
+def _take(setting, shape, bodies, law, go, windows, state, shared):
     """A chunk after the step, and its health."""
     dt, dx, parameters = shared
     transfer = ruled_from_windows if setting.ruled else from_windows
     distance = stage(go, lambda cells: distances(cells, setting.kernel, shape), state.cells)
     v, per_cell = transfer(setting.kernel, go, distance, windows)
     new = stage(go, partial(_respond, law), state, v, per_cell, dt, dx, parameters)
-    return stage(go, partial(_check, shape), new, state.volume, dt, dx)
+    return stage(go, partial(_check, shape, bodies), new, state.cells, state.volume, dt, dx)
 
 
-def _check(shape, state, volume, dt, dx):
+def _check(shape, bodies, state, before, volume, dt, dx):
     """The state held inside the grid, what is not finite taken out, and its health."""
-    held = jnp.clip(state.cells, 1, (np.array(shape)[:, None] - 2.0).astype(state.cells.dtype))
+    low, high = np.ones((3, 1)), np.array(shape)[:, None] / np.array([[bodies], [1], [1]]) - 2.0
+    low, high = low.astype(before.dtype), high.astype(before.dtype)
+    if bodies > 1:
+        width = shape[0] // bodies
+        start = jnp.floor(before[:1] / width) * width * np.eye(3, 1, dtype=before.dtype)
+        low, high = low + start, high + start
+    held = jnp.clip(state.cells, low, high)
     alive = volume[0] > 0
     J = determinant(by_component(state.F))
     out = jnp.stack([state.cells < held, state.cells > held], 1) & alive
@@ -187,9 +210,11 @@ def _only_finite(state, shape):
 
 
 def free_velocity(
-    scene: Scene, nodes: Float[Array, "x y z 4"]
-) -> tuple[Bool[Array, "x y z 1"], Float[Array, "x y z 3"]]:
+    scene: Scene, nodes: Float[Array, "n y z 4"]
+) -> tuple[Bool[Array, "*b x y z 1"], Float[Array, "*b x y z 3"]]:
     """Which nodes have mass, and their velocities [m/s] under gravity, with nothing in the way."""
+    if scene.contact is not None:
+        nodes = nodes.reshape(scene.bodies, *scene.grid.shape, 4)
     mass = nodes[..., :1] / scene.unit_mass
     # Below this a node's mass squared, by which derivatives divide, leaves the range of floating point.
     filled = mass > jnp.finfo(mass.dtype).tiny ** 0.5
@@ -197,21 +222,39 @@ def free_velocity(
     return filled, jnp.where(filled, velocity, 0.0)
 
 
+def _part_bodies(setting, scene, states, nodes, velocity):
+    """Velocities [b x y z 3] after bodies met. Where their matter is goes to the grid as momentum would."""
+    width = scene.grid.shape[0]
+
+    def moments(state):
+        along = jnp.array([1, 0, 0], state.cells.dtype)[:, None]
+        place = state.cells - jnp.floor(state.cells[:, :1] / width) * width * along
+        squares = (place**2).sum(1, keepdims=True)
+        rest = {"C": 0 * state.C, "stress": 0 * state.stress}
+        return state._replace(mass=state.mass * squares, v=place / squares, **rest)
+
+    moment = _to_grid(setting, scene, [moments(state) for state in states])
+    apart = (scene.bodies, *scene.grid.shape, 4)
+    mass = nodes.reshape(apart)[..., :1]
+    specific = scene.specific_volume[:, None, None, None, None]
+    return scene.contact.part(velocity, mass / scene.unit_mass, specific * mass, specific * moment.reshape(apart))
+
+
 def boundaries(
-    setting: Setting, scene: Scene, velocity: Float[Array, "x y z 3"], *, time: Array
-) -> Float[Array, "x y z 3"]:
+    setting: Setting, scene: Scene, velocity: Float[Array, "*b x y z 3"], *, time: Array
+) -> Float[Array, "n y z 3"]:
     """Velocities of the nodes after colliders, stationary matter and the walls of the domain."""
     for collider, contact in zip(scene.colliders, scene.contacts):
         contact = collider.contact(scene.grid.points, time) if contact is None else contact
         velocity = collider.apply(contact, velocity)
     if scene.frozen is not None:
         velocity = jnp.where(scene.frozen[..., None], 0.0, velocity)
-    return _apply_walls(velocity, setting.walls, scene)
+    return _apply_walls(velocity, setting.walls, scene).reshape(*scene.nodes, 3)
 
 
 def _apply_walls(velocity, mode, scene):
     components = [velocity[..., k] for k in range(3)]
-    for axis, nodes in enumerate(velocity.shape[:3]):
+    for axis, nodes in enumerate(velocity.shape[-4:-1]):
         index = (jnp.arange(nodes) + scene.low[axis]).reshape([-1 if k == axis else 1 for k in range(3)])
         low, high = index < WALL, index >= scene.domain[axis] - WALL
         if mode == "sticky":

@@ -15,7 +15,7 @@ FLOORS = [
     {"linalg", "metrics", "lists"},
     {"camera", "materials", "bands", "footprints"},
     {"chunks"},
-    {"tiles", "colliders", "transfers"},
+    {"tiles", "colliders", "transfers", "contact"},
     {"splat", "matter", "passes"},
     {"tile_walks", "clamp", "shells", "relocation", "starts", "overlay", "substep", "io"},
     {"filling", "implicit"},

@@ -10,7 +10,7 @@ from pigjax.errors import InputError
 from pigjax.transfers import KERNELS
 
 _WALLS = ("separate", "slip", "sticky")
-_INTEGRATORS = ("explicit", "implicit")
+_INTEGRATORS = ("explicit", "implicit", "auto")
 _DIFFERENTIATION = ("reverse", "forward")
 
 
@@ -22,7 +22,7 @@ class SimConfig(eqx.Module):
     """
 
     kernel: str = static_field(default="quadratic")  # or "cubic": smoother, 2.4 times as many nodes
-    integrator: str = static_field(default="explicit")  # or "implicit": steps that waves do not limit
+    integrator: str = static_field(default="explicit")  # "implicit": waves do not limit its steps; or "auto"
     substeps: int | None = static_field(default=None)  # per frame; None: the fewest that are stable
     cfl: float = static_field(default=0.4)  # share of a cell that waves and particles cross in a step
     walls: str = static_field(default="separate")  # of the domain: "separate", "slip" or "sticky"

@@ -36,12 +36,14 @@ class Grouping(NamedTuple):
     parts: list[Particles]  # of all laws
     moves: list[bool]
     order: Array | None  # of the particles in the parts, None if it is the user's
+    apart: bool  # whether each body has a grid of its own, all behind each other along x
 
     def particles(self, states: tuple[State, ...], grid: Grid) -> Particles:
         """Particles in the user's order in the states that the groups have reached."""
         remaining = iter(states)
         moved = [
-            _ungroup(part, next(remaining), grid) if moves else part for part, moves in zip(self.parts, self.moves)
+            _ungroup(part, next(remaining), grid, self.apart) if moves else part
+            for part, moves in zip(self.parts, self.moves)
         ]
         return jax.tree.map(lambda *pieces: self._merge(pieces), *moved)
 
@@ -54,7 +56,9 @@ class Grouping(NamedTuple):
                 count = len(part)
                 state = jax.tree.map(lambda rows, count=count: rows[:, :count], next(remaining))
                 visual = state.F if state.visual is None else state.visual
-                pieces.append((_positions(state, grid), state.v, visual.reshape(*visual.shape[:2], 3, 3)))
+                pieces.append(
+                    (_positions(part, state, grid, self.apart), state.v, visual.reshape(*visual.shape[:2], 3, 3))
+                )
             else:
                 pieces.append((part.x[None], part.v[None], part.F_visual[None]))
         frames = max(x.shape[0] for x, _, _ in pieces)
@@ -66,7 +70,9 @@ class Grouping(NamedTuple):
         return merged if self.order is None else jnp.take(merged, jnp.argsort(self.order), axis)
 
 
-def group_by_law(particles: Particles, table: MaterialTable, grid: Grid, pieces: int) -> Grouping:
+def group_by_law(
+    particles: Particles, table: MaterialTable, grid: Grid, pieces: int, *, apart: bool = False
+) -> Grouping:
     """Particles by law.
 
     The sizes are static, from `particles.counts`, made whole multiples of `pieces` by particles without mass.
@@ -82,11 +88,13 @@ def group_by_law(particles: Particles, table: MaterialTable, grid: Grid, pieces:
     parts = _split(particles if order is None else _reorder(particles, order), [sizes[law] for law in laws])
     moves = [LAWS[law].respond is not None for law in laws]
     pairs = [
-        _group(law, part, rows_of[law], table, grid, pieces) for law, part, moving in zip(laws, parts, moves) if moving
+        _group(law, part, rows_of[law], table, grid, pieces, apart)
+        for law, part, moving in zip(laws, parts, moves)
+        if moving
     ]
     still = next((part for part, moving in zip(parts, moves) if not moving), None)
     groups, states = tuple(group for group, _ in pairs), tuple(state for _, state in pairs)
-    return Grouping(groups, states, still, parts, moves, order)
+    return Grouping(groups, states, still, parts, moves, order, apart)
 
 
 def by_component(rows: Array) -> Array:
@@ -108,7 +116,7 @@ def bound_visual(state: State, stretch: tuple[float, float]) -> State:
     return state._replace(visual=linalg.matmul3(u * s[..., None, :], linalg.transpose(v)).reshape(-1, 9))
 
 
-def _group(law, part, rows, table, grid, pieces):
+def _group(law, part, rows, table, grid, pieces, apart):
     """Particles of one law with their present stress, at rest and without mass where they are not finite."""
     kind, several = LAWS[law], len(rows) > 1
     parameters = table.rows(np.array(rows) if several else rows[0])
@@ -123,7 +131,7 @@ def _group(law, part, rows, table, grid, pieces):
     eye = np.eye(3).reshape(-1)
     cells = (part.x - grid.origin) / grid.dx
     state = State(
-        cells=sound(cells, np.array(grid.shape) / 2),
+        cells=sound(cells, np.array(grid.shape) / 2) + (_own_grid(part, grid) if apart else 0),
         v=sound(part.v, 0),
         C=sound(part.C, 0),
         F=sound(part.F, eye),
@@ -147,7 +155,7 @@ def _group(law, part, rows, table, grid, pieces):
     return Group(law, parameters), state
 
 
-def _ungroup(part, state, grid):
+def _ungroup(part, state, grid, apart):
     """Particles with the state that their group has reached; x is NaN of those that are no longer finite."""
     state = jax.tree.map(lambda rows: rows[: len(part)], state)
     F = state.F.reshape(-1, 3, 3)
@@ -155,7 +163,7 @@ def _ungroup(part, state, grid):
         lambda p: (p.x, p.v, p.C, p.F, p.hardening, p.F_visual),
         part,
         (
-            _positions(state, grid),
+            _positions(part, state, grid, apart),
             state.v,
             state.C.reshape(-1, 3, 3),
             F,
@@ -165,8 +173,14 @@ def _ungroup(part, state, grid):
     )
 
 
-def _positions(state, grid):
-    return jnp.where(state.volume > 0, grid.origin + grid.dx * state.cells, jnp.nan)
+def _positions(part, state, grid, apart):
+    cells = state.cells - (_own_grid(part, grid) if apart else 0)
+    return jnp.where(state.volume > 0, grid.origin + grid.dx * cells, jnp.nan)
+
+
+def _own_grid(part, grid):
+    """Where the grid of a particle's body begins [cells]."""
+    return (part.body[:, None] * grid.shape[0] * np.eye(1, 3, dtype=int)).astype(part.x.dtype)
 
 
 def _split(particles, sizes):

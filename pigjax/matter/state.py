@@ -33,6 +33,7 @@ class Particles(eqx.Module):
     material: Int[Array, "p"] = array_field()  # row of the material table
     hardening: Float[Array, "p"] = array_field()  # internal variable of the plastic laws
     gaussian: Int[Array, "p"] = array_field()  # index of the Gaussian it carries, -1 for none
+    body: Int[Array, "p"] = array_field()  # what `BodyContact` keeps apart
     counts: tuple[int, ...] = static_field()  # particles of each row, which sizes the groups by law
 
     def __len__(self) -> int:
@@ -77,6 +78,7 @@ def make_particles(
     material: Int[Array, "p"] | np.ndarray | int = 0,
     velocity: Any = 0.0,
     gaussian: Int[Array, "p"] | np.ndarray | int = -1,
+    body: Int[Array, "p"] | np.ndarray | int = 0,
 ) -> Particles:
     """Particles at rest shape, in the order given.
 
@@ -87,6 +89,7 @@ def make_particles(
         material: row of the table of each particle, or of every one; concrete, since it sizes the groups by law.
         velocity: [m/s], broadcast against x.
         gaussian: index of the Gaussian that each carries, -1 for none.
+        body: number of the body that each belongs to, for `BodyContact`.
 
     Raises:
         InputError: there are no particles, a volume is not > 0, or a row is not in the table.
@@ -116,6 +119,7 @@ def make_particles(
         material=jnp.asarray(rows, jnp.int32),
         hardening=jnp.zeros(count, x.dtype),
         gaussian=jnp.broadcast_to(jnp.asarray(gaussian, jnp.int32), (count,)),
+        body=jnp.broadcast_to(jnp.asarray(body, jnp.int32), (count,)),
         counts=tuple(int(n) for n in np.bincount(rows, minlength=len(table))),
     )
 

@@ -16,12 +16,13 @@ from pigjax import io
 from pigjax.camera import Camera, orbit, stack_cameras
 from pigjax.clamp import ClampParams
 from pigjax.colliders import Collider
+from pigjax.contact import BodyContact
 from pigjax.errors import SceneError
 from pigjax.materials import Material, MaterialTable
 from pigjax.matter import Particles
 from pigjax.mls_mpm import SimConfig
 from pigjax.particles import Binding, bind, seed_particles
-from pigjax.scene.schema import CameraSpec, Scene, _suggest
+from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec, _suggest
 from pigjax.segmentation import Labels, fill_unseen, lift_masks
 from pigjax.solids import collider_from_gaussians
 from pigjax.splat import Gaussians
@@ -44,6 +45,7 @@ class Plan:
     table: MaterialTable
     binding: Binding | None
     colliders: tuple[Collider, ...]
+    contact: BodyContact | None
     gravity: Float[np.ndarray, "3"]
     config: SimConfig
     clamp: ClampParams
@@ -145,8 +147,9 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         table=table,
         binding=binding if len(binding) else None,
         colliders=colliders,
+        contact=_contact(spec, len(moving)),
         gravity=vector,
-        config=SimConfig(kernel=spec.kernel, cfl=spec.cfl),
+        config=SimConfig(kernel=spec.kernel, cfl=spec.cfl, integrator=spec.integrator),
         clamp=ClampParams(
             tau_min=jnp.asarray(scene.clamp.tau_min),
             tau_max=jnp.asarray(scene.clamp.tau_max),
@@ -157,6 +160,14 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         frame_dt=1 / (spec.fps * spec.slow_motion),
         labels=labels,
     )
+
+
+def _contact(spec: SimulationSpec, bodies: int) -> BodyContact | None:
+    if spec.contact_friction is None or bodies < 2:
+        return None
+    if not spec.contact_friction >= 0:
+        raise SceneError(f"simulation.contact_friction = {spec.contact_friction}: must be >= 0.")
+    return BodyContact(bodies=bodies, friction=jnp.asarray(spec.contact_friction))
 
 
 def _still_solids(scene: Scene, inputs: Inputs, labels: Labels) -> dict[str, Collider]:

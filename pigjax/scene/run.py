@@ -18,7 +18,7 @@ from pigjax.boxes import Fit, devices_for
 from pigjax.camera import Camera
 from pigjax.errors import SimulationError
 from pigjax.matter import Health, Particles, fit_grid, vast_grid
-from pigjax.mls_mpm import choose_substeps
+from pigjax.mls_mpm import choose_integrator, choose_substeps
 from pigjax.overlay import id_image, legend_sheet, overlay
 from pigjax.particles import deform
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, segment, signature
@@ -89,6 +89,7 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
         "colliders": [type(c).__name__ for c in plan.colliders],
         "kernel": plan.config.kernel,
         "clamp": scene.clamp.mode,
+        "body_contact": plan.contact is not None,
         "sh_coefficients": inputs.gaussians.sh.shape[1],
     }
     report.sizes |= {
@@ -114,16 +115,11 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
         saved, particles = io.load_pytree(checkpoint, (np.zeros((), np.int64), particles))
         done = int(saved)
     domain = vast_grid(scene.simulation.dx)
-    substeps = choose_substeps(
-        particles,
-        fit_grid(particles.x, scene.simulation.dx),
-        plan.table,
-        plan.config,
-        frames=max(frames - done, 1),
-        frame_dt=plan.frame_dt,
-        gravity=plan.gravity,
-        colliders=plan.colliders,
-    )
+    steps: dict[str, Any] = {"frames": max(frames - done, 1), "frame_dt": plan.frame_dt}
+    steps |= {"gravity": plan.gravity, "colliders": plan.colliders}
+    near = fit_grid(particles.x, scene.simulation.dx)
+    config = choose_integrator(particles, near, plan.table, plan.config, **steps)
+    substeps = choose_substeps(particles, near, plan.table, config, **steps)
     fit = Fit()
     worst: list[Health] = []
     dtype = particles.x.dtype
@@ -133,11 +129,12 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
             particles,
             domain,
             plan.table,
-            plan.config,
-            devices_for(plan.config, len(particles)),
+            config,
+            devices_for(config, len(particles)),
             dt=jnp.asarray(plan.frame_dt / substeps, dtype),
             gravity=jnp.asarray(plan.gravity, dtype),
             colliders=plan.colliders,
+            contact=plan.contact,
             start=jnp.asarray(plan.frame_dt * (frame - 1), dtype),
             frames=1,
             substeps=substeps,
@@ -150,6 +147,7 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
             )
         _save(folder, frame, particles, key, checkpoint)
     tell("simulate", frames, frames)
+    report.modelled["integrator"] = config.integrator
     report.sizes |= {"substeps_per_frame": substeps, "last_grid": fit.shape, "resumed_from_frame": done}
     if worst:
         report.health |= {

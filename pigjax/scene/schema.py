@@ -53,6 +53,8 @@ class SimulationSpec(Struct, forbid_unknown_fields=True, frozen=True):
     fill: bool = True  # fill objects inside
     cfl: float = 0.4
     kernel: str = "quadratic"
+    integrator: Literal["explicit", "implicit", "auto"] = "explicit"
+    contact_friction: float | None = None  # of objects on each other, which then never fuse; None: one common field
     seed: int = 0
 
 

@@ -1,0 +1,139 @@
+"""A simulation on fitted boxes, on several devices or in a batch is the simulation on the whole grid."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pigjax.boxes import Fit
+from pigjax.colliders import Plane
+from pigjax.errors import InputError
+from pigjax.materials import Material, material_table, preset
+from pigjax.matter import Grid, fit_grid, make_particles, vast_grid
+from pigjax.mls_mpm import SimConfig, rollout, stable_dt
+
+DX = 1 / 16
+TABLE = material_table([preset("sand"), Material("neo_hookean", density=500.0, young=2e4, poisson=0.3)])
+FLOOR = Plane(point=jnp.asarray([0.0, 0.0, 0.7]), normal=jnp.asarray([0.0, 0.0, 1.0]))
+STEPS = {"frame_dt": 0.01, "gravity": (0.0, 0.0, -9.8), "colliders": (FLOOR,)}
+
+
+def two_cubes():
+    axis = DX / 2 * np.arange(6)
+    cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    x = np.concatenate([cube + np.array([1.0, 1.0, 0.8]), cube + np.array([1.5, 1.2, 0.9])])
+    material = np.repeat([0, 1], len(cube))
+    velocity = np.where(material[:, None] == 0, [0.0, 0.0, 0.0], [-1.0, 0.5, 0.0])
+    return make_particles(jnp.asarray(x), volume=(DX / 2) ** 3, table=TABLE, material=material, velocity=velocity)
+
+
+def assert_same(a, b, atol):
+    for name in ("x", "v", "F", "F_visual", "hardening"):
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=atol, err_msg=name)
+
+
+def test_a_vast_domain_gives_what_a_small_one_gives(x64):
+    particles, config = two_cubes(), SimConfig(substeps=16)
+    small = Grid(jnp.zeros(3), jnp.asarray(DX), (36, 36, 36))
+    a, path_a, health = rollout(particles, small, TABLE, config, frames=6, **STEPS)
+    b, path_b, _ = rollout(particles, vast_grid(DX), TABLE, config, frames=6, **STEPS)
+    health.raise_if_bad()
+    assert_same(a, b, 1e-9)
+    np.testing.assert_allclose(path_a.x, path_b.x, atol=1e-9)
+    assert float(jnp.abs(path_a.x[-1] - particles.x).max()) > 0.9 * DX  # they did move
+
+
+def test_a_box_that_matter_outruns_is_made_larger(x64):
+    """Matter that free flight would not have carried so far: thrown back by a moving wall."""
+    particles = two_cubes()
+    bat = Plane(point=jnp.asarray([1.2, 0, 0]), normal=jnp.asarray([1.0, 0, 0]), velocity=jnp.asarray([8.0, 0, 0]))
+    fit, config = Fit(slack=0.0), SimConfig(substeps=40)
+    step = {
+        "dt": jnp.asarray(0.02 / 40),
+        "gravity": jnp.zeros(3),
+        "colliders": (bat,),
+        "contact": None,
+        "start": jnp.zeros(()),
+        "frames": 1,
+        "substeps": 40,
+    }
+    from pigjax import boxes
+
+    boxes_room = boxes._ROOM
+    boxes._ROOM = 1.0
+    try:
+        moved, _, health = fit.frame(particles, vast_grid(DX), TABLE, config, 1, **step)
+    finally:
+        boxes._ROOM = boxes_room
+    assert int(health.escaped) == 0
+    whole, _, _ = rollout(
+        particles, fit_grid(particles.x, DX, margin=0.7), TABLE, config, frames=1, frame_dt=0.02, gravity=(0, 0, 0),
+        colliders=(bat,),
+    )  # fmt: skip
+    assert_same(moved, whole, 1e-9)
+
+
+def test_two_devices_give_what_one_gives(x64):
+    particles, grid = two_cubes(), fit_grid(np.asarray(two_cubes().x), DX, margin=0.3)
+    one, path_1, health_1 = rollout(particles, grid, TABLE, SimConfig(substeps=16, devices=1), frames=4, **STEPS)
+    two, path_2, health_2 = rollout(particles, grid, TABLE, SimConfig(substeps=16, devices=2), frames=4, **STEPS)
+    assert_same(one, two, 1e-10)
+    np.testing.assert_allclose(path_1.F_visual, path_2.F_visual, atol=1e-10)
+    for a, b in zip(jax.tree.leaves(health_1), jax.tree.leaves(health_2)):
+        np.testing.assert_allclose(a, b, rtol=1e-10)
+
+
+def test_two_devices_give_the_gradient_of_one(x64):
+    particles = two_cubes()
+    grid = fit_grid(np.asarray(particles.x), DX, margin=0.3)
+
+    particles = eqx.tree_at(lambda p: p.F, particles, 0.97 * particles.F)
+
+    def height(young, speed, devices):
+        table = eqx.tree_at(lambda t: t.young, TABLE, TABLE.young.at[1].set(young))
+        moved = eqx.tree_at(lambda p: p.v, particles, particles.v.at[:, 0].add(speed))
+        config = SimConfig(substeps=10, devices=devices)
+        end, _, _ = rollout(moved, grid, table, config, frames=3, **STEPS)
+        return (end.x[:, 2] ** 2).sum() + end.x[:, 0].sum()
+
+    one, two = (jax.grad(height, (0, 1))(2e4, 0.1, devices) for devices in (1, 2))
+    np.testing.assert_allclose(two, one, rtol=1e-9)
+
+
+def test_forward_mode_equals_reverse_mode(x64):
+    particles = two_cubes()
+    particles = eqx.tree_at(lambda p: p.F, particles, 0.97 * particles.F)
+    grid = fit_grid(np.asarray(particles.x), DX, margin=0.3)
+
+    def height(young, mode):
+        table = eqx.tree_at(lambda t: t.young, TABLE, TABLE.young.at[1].set(young))
+        config = SimConfig(substeps=10, differentiation=mode)
+        end, _, _ = rollout(particles, grid, table, config, frames=2, **STEPS)
+        return (end.x[:, 2] ** 2).sum()
+
+    _, forward = jax.jvp(lambda young: height(young, "forward"), (2e4,), (1.0,))
+    np.testing.assert_allclose(forward, jax.grad(height)(2e4, "reverse"), rtol=1e-6)
+
+
+def test_a_stopped_rollout_gives_back_its_last_good_frame():
+    """An unstable step is forced, which takes a few frames to break down."""
+    particles = jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == float else a, two_cubes())
+    particles = eqx.tree_at(lambda p: p.F, particles, 0.99 * particles.F)
+    small = Grid(jnp.zeros(3, jnp.float32), jnp.asarray(DX, jnp.float32), (36, 36, 36))
+    config = SimConfig(substeps=1, stop=True, force=True)
+    limit = float(stable_dt(TABLE, small, max_speed=1.0, cfl=1.0))
+    end, path, health = rollout(
+        particles, small, TABLE, config, frames=30, frame_dt=5 * limit, gravity=(0.0, 0.0, -9.8), colliders=(FLOOR,)
+    )
+    bad = int(health.first_bad_frame)
+    print("bad in frame", bad, health.problems())
+    assert 0 < bad < 30
+    np.testing.assert_array_equal(end.x, path.x[bad - 1])
+    np.testing.assert_array_equal(path.x[bad:], np.broadcast_to(path.x[bad - 1], path.x[bad:].shape))
+    assert np.isfinite(end.F).all()
+
+
+def test_choices_of_devices_are_checked():
+    with pytest.raises(InputError, match=r"SimConfig.devices = 99: JAX has 2 local devices"):
+        SimConfig(devices=99)
