@@ -59,9 +59,11 @@ def run(name, folder):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("cases", nargs="*", choices=[*CASES, []], help=f"of {', '.join(CASES)}; all without")
+    parser.add_argument("cases", nargs="*", metavar="case", help=f"{', '.join(CASES)}; all without")
     parser.add_argument("--plots", type=Path, default=DOCS / "media", help="folder of the plots")
     arguments = parser.parse_args()
+    if unknown := set(arguments.cases) - set(CASES):
+        parser.error(f"no case {', '.join(sorted(unknown))}: choose of {', '.join(CASES)}")
     folder = arguments.plots.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     plt.switch_backend("agg")

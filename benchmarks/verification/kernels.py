@@ -80,8 +80,8 @@ def kernels():
 
     A free bar of 16 cells rings in its first mode for 20 periods at a strain of about five per cent, and a block of 6
     cells a side turns once, both in float64; 10k random particles on 64³ nodes in float32 give the time, of this
-    machine. APIC keeps only what an affine field holds of a particle's surroundings, and the cubic kernel's surroundings
-    are larger: it damps more and costs more. Its merit is a smoother stress where particles cross cells.
+    machine. APIC keeps only what an affine field holds of a particle's surroundings, and the cubic kernel's are wider:
+    it damps more and costs more. Its merit is a smoother stress where particles cross cells.
     """
     rows, series = [], {}
     for kernel in KERNELS:
