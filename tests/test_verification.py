@@ -54,7 +54,7 @@ def test_generalised_vortex_converges_with_second_order(amplitude, bound):
 
 
 def test_two_discs_rebound():
-    """At 1/20 m they meet 1.6 cells early, part at 0.83 of their speed, and keep 71 % of their energy (94 % at 1/80)."""
+    """At 1/20 m they meet 1.6 cells early, part at 0.83 of their speed, and keep 71 % of the energy; at 1/80 94 %."""
     t, moving, stored, approach, drift = discs(20)
     early = (TOUCH - t[np.argmax(approach < 0.99)]) * 0.2 * math.sqrt(2) * 20
     total = moving + stored
@@ -115,12 +115,12 @@ def test_cantilever_sags_by_timoshenkos_closed_form(x64):
     assert swing == pytest.approx(1, abs=0.035)
 
 
-@pytest.mark.parametrize(("kernel", "kept"), [("quadratic", 0.995), ("cubic", 0.985)])
-def test_turning_block_keeps_its_angular_momentum_and_nearly_its_energy(x64, kernel, kept):
-    """After a turn 0.3 % of the energy is gone, 1.0 % with the cubic kernel."""
-    energy, drift = turning(kernel)
+@pytest.mark.parametrize("kernel", ["quadratic", pytest.param("cubic", marks=pytest.mark.slow)])
+def test_turning_block_keeps_its_angular_momentum_and_nearly_its_energy(x64, kernel):
+    """After half a turn less than 0.3 % of the energy is gone, which is what a whole turn takes."""
+    energy, drift = turning(kernel, turns=0.5)
     print(f"turning block, {kernel}: energy kept {energy:.4f}, angular momentum drift {drift:.0e}")
-    assert kept < energy < 1 + 1e-9
+    assert 0.997 < energy < 1 + 1e-9
     assert drift < 1e-10
 
 

@@ -43,10 +43,12 @@ def front(cells, kernel="quadratic"):
 
 
 def dam_break():
-    """A column of water twice as high as wide collapses on a smooth floor in plane strain; sound is ten times as fast
-    as the fall, viscosity zero. The front is the foremost particle. Martin and Moyce's gate does not vanish at once and
-    their floor is not smooth, so every simulation without them runs ahead at first: the first row compares the front
-    where it is, the second its speed between Z = 2 and 4, which the gate does not touch.
+    """A column of water twice as high as wide collapses on a smooth floor in plane strain.
+
+    Sound is ten times as fast as the fall, viscosity zero. The front is the foremost particle. The first row compares
+    the front where it is, the second its speed beyond Z = 2. The offset arises mostly before Z = 1.5: the
+    experiment's gate opens in finite time, which is why published comparisons often shift the time. Finer cells let the
+    thin tongue start sooner and do not close it.
     """
     rows, series = [], []
     for cells in (12, 24):
@@ -142,35 +144,53 @@ def lube(aspect, axisymmetric):
     return 1.2 * aspect if aspect < 2.3 else 1.9 * aspect ** (2 / 3)
 
 
-STUDIES = ((1.0, False, 24), (3.0, False, 18), (1.0, True, 10), (1.0, True, 16))
+def sand():
+    """Columns of dry sand between a smooth wall and open floor, in plane strain, collapse on a rough floor.
 
-
-def sand(studies=STUDIES):
-    """Columns of dry sand collapse on a rough floor.
-
-    Lube et al. found the run-out a function of height over width alone: 1.2 a or 1.9 a^⅔ in plane strain (2005, doi
-    10.1103/PhysRevE.72.041301), 1.24 a or 1.6 √a for a cylinder (2004, doi 10.1017/S0022112004009036). Their sands
-    repose at about 31 degrees, so the law is given the friction angle at which an endless slope of it stands at 31
-    degrees; no number is fitted. The edge is where the deposit is a quarter of a cell deep, half a layer of particles.
-    The cylinder spreads thinner, and three dimensions afford fewer cells: it falls short by more than the other two and
-    gains as cells shrink.
+    Lube et al. (2005, doi 10.1103/PhysRevE.72.041301) found the run-out a function of height over width alone, 1.2 a or
+    1.9 a^⅔. Their sands repose at about 31 degrees, so the law is given the friction angle at which an endless slope of
+    it stands at 31 degrees; no number is fitted. The edge is where the deposit is a quarter of a cell deep: half a
+    layer of particles. The deposit's foot is thin, so run-out grows a little as cells shrink.
     """
-    rows, series = [], []
-    angle = friction_angle(math.radians(31))
-    for aspect, round_, cells in studies:
-        ours, x = column(aspect, cells, angle=angle, axisymmetric=round_)
-        series.append((aspect, round_, x))
-        name = f"sand {'cylinder' if round_ else 'in plane strain'}, a = {aspect:g}, {cells} cells"
-        year = 2004 if round_ else 2005
-        expected = lube(aspect, round_)
-        rows.append(Row(name, f"Lube et al. {year}", f"{expected:.2f}", f"{ours:.2f}", percent(ours / expected - 1)))
+    return _columns("sand in plane strain", ((1.0, 16), (1.0, 24), (3.0, 12), (3.0, 18)), axisymmetric=False)
+
+
+def sand_cylinder():
+    """A cylinder of the same sand, a quarter of it between smooth walls.
+
+    Lube et al. (2004, doi 10.1017/S0022112004009036): 1.24 a or 1.6 √a. It spreads thinner than the columns in plane
+    strain, and three dimensions afford fewer cells: it falls short by more, and gains as cells shrink. The last row
+    takes the run-out as linear in the size of a cell and draws it to zero: an estimate, not a simulation.
+    """
+    case = _columns("sand cylinder", ((1.0, 10), (1.0, 15)), axisymmetric=True)
+    coarse, fine = (float(row.ours) for row in case.rows)
+    limit, expected = fine + (fine - coarse) * 10 / (15 - 10), lube(1.0, True)
+    estimate = percent(limit / expected - 1)
+    case.rows.append(
+        Row("sand cylinder, extrapolated", "Lube et al. 2004", f"{expected:.2f}", f"{limit:.2f}", estimate)
+    )
+    return case
+
+
+def _columns(name, studies, *, axisymmetric):
+    rows, last = [], {}
+    for aspect, cells in studies:
+        ours, x = column(aspect, cells, angle=friction_angle(math.radians(31)), axisymmetric=axisymmetric)
+        last[aspect] = x
+        expected = lube(aspect, axisymmetric)
+        source = f"Lube et al. {2004 if axisymmetric else 2005}"
+        title = f"{name}, a = {aspect:g}, {cells} cells"
+        rows.append(Row(title, source, f"{expected:.2f}", f"{ours:.2f}", percent(ours / expected - 1)))
 
     def draw(figure):
-        for axes, (aspect, round_, x) in zip(figure.subplots(3, 1), [series[0], series[1], series[-1]]):
-            away, up = (np.hypot(x[:, 0], x[:, 1]), x[:, 2]) if round_ else (x[:, 0], x[:, 1])
+        for axes, (aspect, x) in zip(np.ravel(figure.subplots(len(last), 1)), last.items()):
+            away, up = (np.hypot(x[:, 0], x[:, 1]), x[:, 2]) if axisymmetric else (x[:, 0], x[:, 1])
             axes.plot(away, up, ".", ms=1)
-            axes.plot([0, 1, 1], [aspect, aspect, 0], "k:")
-            axes.axvline(1 + lube(aspect, round_), color="C1")
-            axes.set(aspect="equal", xlabel="r/r₀" if round_ else "x/d₀", title=f"a = {aspect:g}")
+            axes.plot([0, 1, 1], [aspect, aspect, 0], "k:", label="at the start")
+            axes.axvline(1 + lube(aspect, axisymmetric), color="C1", label="Lube et al.")
+            axes.set(
+                aspect="equal", xlabel="r/r₀" if axisymmetric else "x/d₀", ylabel="height", title=f"a = {aspect:g}"
+            )
+            axes.legend(fontsize=7)
 
     return Case(rows, draw)

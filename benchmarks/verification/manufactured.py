@@ -105,11 +105,11 @@ def axis_aligned():
     """An axis-aligned motion, u_i = A sin(π X_i) sin(π c t + φ_i), after Sadeghirad, Brannon and Burghardt (2011, doi
     10.1002/nme.3110).
 
-    A = 0.05 m, c = 10 m/s and φ = 0, 2π/3, 4π/3 in a unit cube of neo-Hookean matter between slip walls, ν = 0.3, eight
-    particles a cell, over a whole period; float32. The error is the largest root mean square over time of the
-    particles' displacement, as a share of A. The walls make it first order: as in the fixed bar, the matter acts too long by part
-    of a cell at either, which detunes the swing, and over a whole period that adds up. The same motion with cosines
-    along a bar with free ends, ν = 0, where no wall is, shows the order of the method itself; float64.
+    A = 0.05 m, c = 10 m/s and φ = 0, 2π/3, 4π/3 in a unit cube of neo-Hookean matter between slip walls, ν = 0.3,
+    eight particles a cell, over a whole period; float32. The error is the largest root mean square over time of the
+    particles' displacement, as a share of A. The walls make it first order: as in the fixed bar, the matter acts too
+    long by part of a cell at either, which detunes the swing, and over a whole period that adds up. The same motion
+    with cosines along a bar with free ends, ν = 0, where no wall is, shows the order of the method itself; float64.
     """
     rows, series = [], {}
     studies = (("cube", cube_error, (6, 12, 20)), ("free bar", in_float64(free_error), (8, 16, 32, 64)))
