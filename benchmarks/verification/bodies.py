@@ -189,13 +189,12 @@ def modulus(cells, *, axes, strain=0.005, transits=10):
         closing = -strain / duration * normal
         plates.append(Plane((1 - 1e-4 * dx) * normal, -normal, mode="slip", velocity=closing))
     colliders = (*plates, *held(*[k for k in range(3) if k not in axes]))
-    config = SimConfig(cfl=0.4)
     substeps = math.ceil(duration / frames / float(stable_dt(table, grid, max_speed=strain / duration)))
     _, path, health = rollout(
         p,
         grid,
         table,
-        SimConfig(substeps=substeps, cfl=config.cfl),
+        SimConfig(substeps=substeps),
         frames=frames,
         frame_dt=duration / frames,
         gravity=NO_GRAVITY,
@@ -204,9 +203,8 @@ def modulus(cells, *, axes, strain=0.005, transits=10):
     health.raise_if_bad()
     F = np.asarray(path.F_visual, float)
     J = np.linalg.det(F)
-    stress = float(m.mu) * (F @ np.swapaxes(F, -1, -2) - np.eye(3)) + float(m.lam) * np.log(J)[
-        ..., None, None
-    ] * np.eye(3)
+    mean = float(m.lam) * np.log(J)[..., None, None] * np.eye(3)
+    stress = float(m.mu) * (F @ np.swapaxes(F, -1, -2) - np.eye(3)) + mean
     pressure = -(stress[..., 2, 2] if one else np.trace(stress, axis1=-2, axis2=-1) / 3) / J
     closed = strain * np.arange(1, frames + 1) / frames
     volume = closed if one else -3 * np.log(1 - closed)

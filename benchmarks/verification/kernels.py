@@ -44,6 +44,11 @@ def ringing(kernel, cells=16, periods=20):
     return np.arange(1, frames + 1) / 20, np.asarray(energy / kinetic(p.mass, p.v))
 
 
+def energy_kept(energy):
+    """Mean of the last period by that of the first, of a history by `ringing`."""
+    return energy[-20:].mean() / energy[:20].mean()
+
+
 def turning(kernel, cells=8, turns=1.0):
     """Share of kinetic energy kept, and of angular momentum lost, by a free block after whole turns."""
     dx, omega = 1 / cells, 2 * math.pi
@@ -78,23 +83,17 @@ def seconds(kernel, count=10_000, cells=64, steps=20, repeats=5):
 def kernels():
     """The same problems with the quadratic and the cubic kernel.
 
-    A free bar of 16 cells rings in its first mode for 20 periods at a strain of about five per cent, and a block of 6
-    cells a side turns once, both in float64; 10k random particles on 64³ nodes in float32 give the time, of this
-    machine. APIC keeps only what an affine field holds of a particle's surroundings, and the cubic kernel's are wider:
-    it damps more and costs more. Its merit is a smoother stress where particles cross cells.
+    A free bar of 16 cells rings in its first mode for 20 periods from 0.05 m/s; the energy kept is
+    the mean over the last period by that over the first, since the steps know velocity and strain half a step apart. A
+    block of 6 cells a side turns once. Both in float64; 10k random particles on 64³ nodes in float32 give the time, of
+    a busy machine. APIC keeps only what an affine field holds of a particle's surroundings, and the cubic kernel's are
+    wider: it damps the bar more and costs more. Its merit is a smoother stress where particles cross cells.
     """
     rows, series = [], {}
     for kernel in KERNELS:
         _, energy = series[kernel] = in_float64(ringing)(kernel)
-        rows.append(
-            Row(
-                f"ringing bar, {kernel}",
-                "energy conserved",
-                "1",
-                f"{energy[-1]:.4f}",
-                f"{100 * (energy[-1] - 1):+.1f} %",
-            )
-        )
+        kept = energy_kept(energy)
+        rows.append(Row(f"ringing bar, {kernel}", "energy conserved", "1", f"{kept:.4f}", f"{100 * (kept - 1):+.1f} %"))
     for kernel in KERNELS:
         kept, drift = in_float64(turning)(kernel)
         rows.append(
