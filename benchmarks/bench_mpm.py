@@ -1,96 +1,255 @@
-"""Speed and error of MLS-MPM: `python benchmarks/bench_mpm.py [--laws ...] [--cases 10000/64 100000/64] [--steps 20]`.
+"""Speed, error and memory of MLS-MPM: `python benchmarks/bench_mpm.py [part ...] [--rivals PYTHON]`.
 
-One line per case: warm median of the time per substep, compile time apart, and the error of positions after --steps
-against the same run in float64, relative to how far the particles moved.
+Parts: speed (ours on one and all devices, rivals beside), laws, gradient, domain, features, batch, memory. Times are
+medians of warm windows, compile time apart. `--rivals` is the Python of an environment with Taichi 1.7.4 and Warp 1.19,
+`--peers` the folder of their scripts. Without parts, all are run.
 """
 
 import argparse
+import json
 import os
+import resource
 import statistics
+import subprocess
 import time
+from pathlib import Path
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 
-from pigjax.materials import Material, material_table
-from pigjax.matter import Grid, make_particles
-from pigjax.mls_mpm import SimConfig, rollout
+jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
 
+import equinox as eqx  # noqa: E402  (the devices must be there first)
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+from _timing import machine  # noqa: E402
+
+from pigjax.boxes import whole  # noqa: E402
+from pigjax.colliders import Plane  # noqa: E402
+from pigjax.contact import BodyContact  # noqa: E402
+from pigjax.frames import run_frames  # noqa: E402
+from pigjax.materials import LAWS, Material, material_table  # noqa: E402
+from pigjax.matter import Grid, fit_grid, make_particles  # noqa: E402
+from pigjax.mls_mpm import SimConfig, rollout  # noqa: E402
+
+DT = 1e-4  # the rivals' step
+ELASTIC = {"young": 1e5, "poisson": 0.2}
 NUMBERS = {
-    "fixed_corotated": {"young": 1e5, "poisson": 0.2},
-    "neo_hookean": {"young": 1e5, "poisson": 0.2},
-    "stvk_hencky": {"young": 1e5, "poisson": 0.2},
-    "von_mises": {"young": 1e5, "poisson": 0.2, "yield_stress": 1e3},
-    "drucker_prager": {"young": 1e5, "poisson": 0.2, "friction_angle": 0.6},
+    "von_mises": ELASTIC | {"yield_stress": 1e3},
+    "plasticine": ELASTIC | {"yield_stress": 1e3, "hardening_modulus": -1e3},
+    "drucker_prager": ELASTIC | {"friction_angle": 0.6},
+    "foam": ELASTIC | {"yield_stress": 1e3, "viscosity": 10.0},
+    "fibres": ELASTIC | {"fibre_stiffness": 1e5},
     "fluid": {"bulk_modulus": 1e5, "viscosity": 0.1},
 }
-DT = 1e-4  # the rivals' step in shared measurements, stable on 128³ too
+CASES = ((10_000, 64), (100_000, 64), (100_000, 128), (500_000, 128))
+DOWN = (0.0, 0.0, -9.8)
 
 
-def scene(law, count, nodes, dtype):
-    """A cube of 0.3 m with random particles that flies and turns."""
+def scene(law, count, nodes, dtype=np.float32, domain=None):
+    """The rivals' cube of 0.3 m with random particles, falling at 3 m/s."""
     x = np.random.default_rng(0).random((count, 3)) * 0.3 + 0.35
-    velocity = np.array([1.0, -0.5, 0.2]) + 2 * np.cross([0.0, 0.0, 1.0], x - 0.5)
-    table = material_table([Material(law, density=1000.0, **NUMBERS[law])])
-    particles = make_particles(
-        jnp.asarray(x, dtype), volume=0.3**3 / count, table=table, velocity=jnp.asarray(velocity, dtype)
-    )
-    return particles, Grid(jnp.zeros(3, dtype), jnp.asarray(1 / nodes, dtype), (nodes,) * 3), table
+    table = material_table([Material(law, density=1000.0, **NUMBERS.get(law, ELASTIC))])
+    velocity = jnp.asarray([0.0, 0.0, -3.0], dtype)
+    particles = make_particles(jnp.asarray(x, dtype), volume=0.3**3 / count, table=table, velocity=velocity)
+    return particles, Grid(jnp.zeros(3, dtype), jnp.asarray(1 / nodes, dtype), (domain or nodes,) * 3), table
 
 
-def bench(law, count, nodes, steps, repeats):
-    """Print one line."""
-    particles, grid, table = scene(law, count, nodes, np.float32)
-
-    def run(steps):
-        config = SimConfig(substeps=steps)
-        return rollout(particles, grid, table, config, frames=1, frame_dt=steps * DT, gravity=(0.0, 0.0, -9.8))
-
+def timed(run, *, windows=5):
+    """Seconds of the first call, and the median of warm ones."""
     begun = time.perf_counter()
-    end, _, health = jax.block_until_ready(run(steps))
-    first = time.perf_counter() - begun
-    times = []
-    for _ in range(repeats):
+    result = jax.block_until_ready(run())
+    first, times = time.perf_counter() - begun, []
+    for _ in range(windows):
         begun = time.perf_counter()
-        jax.block_until_ready(run(steps))
-        times.append((time.perf_counter() - begun) / steps)
-    seconds = statistics.median(times)
+        jax.block_until_ready(run())
+        times.append(time.perf_counter() - begun)
+    return first, statistics.median(times), result
 
-    with jax.enable_x64(True):
-        exact_particles, exact_grid, exact_table = scene(law, count, nodes, np.float64)
-        exact, _, _ = rollout(
-            exact_particles,
-            exact_grid,
-            exact_table,
-            SimConfig(substeps=steps),
-            frames=1,
-            frame_dt=steps * DT,
-            gravity=(0.0, 0.0, -9.8),
+
+def ours(law, count, nodes, *, steps=40, domain=None, colliders=(), contact=None, **config):
+    """Compile seconds, seconds per substep, end and health."""
+    particles, grid, table = scene(law, count, nodes, domain=domain)
+    if contact is not None:
+        particles = eqx.tree_at(lambda p: p.body, particles, (particles.x[:, 0] > 0.5).astype(jnp.int32))
+
+    def run():
+        settings = SimConfig(substeps=steps, **config)
+        return rollout(
+            particles, grid, table, settings, frames=1, frame_dt=steps * DT, gravity=DOWN, colliders=colliders,
+            contact=contact,
+        )  # fmt: skip
+
+    first, seconds, (end, _, health) = timed(run)
+    return first - seconds, seconds / steps, end, health
+
+
+def rival(arguments, engine, *options):
+    """What a rival's script prints."""
+    script = Path(arguments.peers) / f"mpm_{engine}.py"
+    done = subprocess.run([arguments.rivals, script, *map(str, options)], capture_output=True, text=True, check=False)
+    lines = [line for line in done.stdout.splitlines() if line.startswith("{")]
+    return json.loads(lines[-1]) if lines else {}
+
+
+def speed(arguments):
+    """M particle-updates/s beside rivals, in one run."""
+    all_devices = jax.local_device_count()
+    print("| case | law | ours, 1 device | ours, all | Taichi best | Warp | ours / best rival | compile s | health |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for law, model in (("fixed_corotated", "fcr"), ("neo_hookean", "nh")):
+        for count, nodes in CASES:
+            compile_seconds, one, _, health = ours(law, count, nodes, devices=1)
+            _, every, _, _ = ours(law, count, nodes, devices=all_devices)
+            mine = [count / seconds / 1e6 for seconds in (one, every)]
+            taichi, warp = 0.0, 0.0
+            if arguments.rivals:
+                common = ["--particles", count, "--grid", nodes, "--substeps", 20, "--windows", 5, "--model", model]
+                runs = [["--threads", 1], ["--threads", all_devices]]
+                runs += [["--threads", 1, "--serialize", "--order", "sorted"]] if model == "nh" else []
+                rates = [rival(arguments, "taichi", *common, *run).get("particle_updates_per_s", 0) for run in runs]
+                taichi = max(rates) / 1e6
+                warp = rival(arguments, "warp", *common, "--threads", 1).get("particle_updates_per_s", 0) / 1e6
+            best = max(taichi, warp)
+            ratio = f"{max(mine) / best:.2f}" if best else "-"
+            print(
+                f"| {count // 1000}k/{nodes}³ | {law} | {mine[0]:.2f} | {mine[1]:.2f} | {taichi:.2f} | {warp:.2f} |"
+                f" {ratio} | {compile_seconds:.1f} | {'; '.join(health.problems()) or 'healthy'} |",
+                flush=True,
+            )
+
+
+def laws(arguments):
+    """Every law on one device: time, and the error of positions after 20 steps against float64, relative to the way."""
+    print("| law, 20k/32³ | ns per particle and step | M updates/s | compile s | error to float64 |")
+    print("|---|---|---|---|---|")
+    for law in (name for name, law in LAWS.items() if law.respond is not None):
+        count, nodes, steps = 20_000, 32, 20
+        compile_seconds, seconds, end, _ = ours(law, count, nodes, steps=steps, devices=1)
+        with jax.enable_x64(True):
+            particles, grid, table = scene(law, count, nodes, np.float64)
+            settings = SimConfig(substeps=steps, devices=1)
+            exact, _, _ = rollout(particles, grid, table, settings, frames=1, frame_dt=steps * DT, gravity=DOWN)
+            way = np.abs(exact.x - particles.x).max()
+            error = np.abs(np.asarray(end.x, np.float64) - np.asarray(exact.x)).max() / way
+        each, rate = seconds / count * 1e9, count / seconds / 1e6
+        print(f"| {law} | {each:.0f} | {rate:.2f} | {compile_seconds:.1f} | {error:.1e} |", flush=True)
+
+
+def gradient(arguments):
+    """Forward and backward through 8 and 32 steps at 10k/64³, neo-Hookean, one device, beside the rivals' tapes."""
+    print("| engine | steps | forward substeps/s | forward + backward substeps/s | in forwards | compile s |")
+    print("|---|---|---|---|---|---|")
+    particles, _, table = scene("neo_hookean", 10_000, 64)
+    grid = fit_grid(particles.x, 1 / 64, margin=2 / 64)
+    for steps in (8, 32):
+
+        def height(v, particles, table, steps=steps):
+            moved = eqx.tree_at(lambda p: p.v, particles, v)
+            settings = SimConfig(substeps=steps, devices=1)
+            end, _, _ = rollout(moved, grid, table, settings, frames=1, frame_dt=steps * DT, gravity=DOWN)
+            return end.x[:, 1].mean()
+
+        alone, both = jax.jit(height), jax.jit(jax.value_and_grad(height))
+        _, forward, _ = timed(lambda f=alone: f(particles.v, particles, table), windows=9)
+        first, seconds, _ = timed(lambda f=both: f(particles.v, particles, table), windows=9)
+        print(
+            f"| pigjax | {steps} | {steps / forward:.1f} | {steps / seconds:.1f} | {seconds / forward:.2f} |"
+            f" {first - seconds:.1f} |",
+            flush=True,
         )
-        moved = np.abs(exact.x - exact_particles.x).max()
-        error = np.abs(np.asarray(end.x, np.float64) - np.asarray(exact.x)).max() / moved
-    problems = "; ".join(health.problems()) or "healthy"
-    print(
-        f"mls_mpm {law:15s} {count // 1000:4d}k/{nodes}³ f32  {1 / seconds:7.1f} substeps/s"
-        f"  {count / seconds / 1e6:5.2f} M particle-updates/s  {seconds / count * 1e9:5.0f} ns/particle"
-        f"  compile {first - seconds * steps:4.1f} s  rel.err {error:.1e} vs float64  {problems}",
-        flush=True,
-    )
+    for engine in ("taichi", "warp") if arguments.rivals else ():
+        options = ["--particles", 10_000, "--grid", 64, "--grad", "--substeps", 8, "--model", "nh", "--threads", 1]
+        told = rival(arguments, engine, *options)
+        rates = [told.get(name, 0) for name in ("fwd_substeps_per_s", "fwd_bwd_substeps_per_s")]
+        print(f"| {engine} | 8 | {rates[0]:.1f} | {rates[1]:.1f} | {told.get('ratio_fwdbwd_over_fwd', 0):.2f} | |")
+
+
+def domain(arguments):
+    """The same object in domains of growing size."""
+    print("| domain, 100k particles at dx = 1/64 | ms per substep | against 64³ |")
+    print("|---|---|---|")
+    base = None
+    for sides in (64, 256, 1024):
+        _, seconds, _, _ = ours("fixed_corotated", 100_000, 64, domain=sides, devices=1)
+        base = base or seconds
+        print(f"| {sides}³ | {seconds * 1e3:.2f} | {seconds / base:.2f} |", flush=True)
+
+
+def features(arguments):
+    """What each feature costs a scene that has it; a scene without it traces nothing of it (tests)."""
+    still = Plane(point=jnp.asarray([0, 0, 0.3]), normal=jnp.asarray([0, 0, 1.0]))
+    moving = eqx.tree_at(lambda p: p.velocity, still, jnp.asarray([0, 0, 0.1]), is_leaf=lambda leaf: leaf is None)
+    cases = {
+        "none": {},
+        "cubic kernel": {"kernel": "cubic"},
+        "collider at rest": {"colliders": (still,)},
+        "moving collider": {"colliders": (moving,)},
+        "contact of two bodies": {"contact": BodyContact(bodies=2)},
+    }
+    print("| feature, fixed corotated 100k/64³, one device | ms per substep | against none |")
+    print("|---|---|---|")
+    base = None
+    for name, case in cases.items():
+        _, seconds, _, _ = ours("fixed_corotated", 100_000, 64, devices=1, **case)
+        base = base or seconds
+        print(f"| {name} | {seconds * 1e3:.2f} | {seconds / base:.2f} |", flush=True)
+
+
+def batch(arguments):
+    """Simulations of 1,000 particles together by vmap, against one after another."""
+    print("| simulations of 1k/24³, 20 steps | together ms | one after another ms | gain |")
+    print("|---|---|---|---|")
+    particles, _, table = scene("neo_hookean", 1000, 24)
+    grid = fit_grid(particles.x, 1 / 24, margin=1 / 24)
+
+    def end(young):
+        own = eqx.tree_at(lambda t: t.young, table, jnp.full_like(table.young, young))
+        settings = SimConfig(substeps=20, devices=1)
+        return rollout(particles, grid, own, settings, frames=1, frame_dt=20 * DT, gravity=DOWN)[0].x
+
+    single, together = jax.jit(end), jax.jit(jax.vmap(end))
+    for count in (1, 4, 16):
+        young = jnp.linspace(1e4, 1e5, count)
+        _, vmapped, _ = timed(lambda young=young: together(young))
+        _, serial, _ = timed(lambda young=young: [single(e) for e in young])
+        print(f"| {count} | {vmapped * 1e3:.1f} | {serial * 1e3:.1f} | {serial / vmapped:.2f} |", flush=True)
+
+
+def memory(arguments):
+    """Bytes of one compiled frame, and of the process."""
+    print("| case | temporary and output bytes per particle | gradient of 32 steps | process peak MB |")
+    print("|---|---|---|---|")
+    for count, nodes in ((100_000, 64), (500_000, 128)):
+        particles, _, table = scene("fixed_corotated", count, nodes)
+        grid = fit_grid(particles.x, 1 / nodes, margin=2 / nodes)
+        settings, step = SimConfig(substeps=32, devices=1), {"frames": 1, "substeps": 32, "start": jnp.float32(0)}
+        step |= {"dt": jnp.float32(DT), "gravity": jnp.asarray(DOWN), "colliders": (), "contact": None}
+        used = run_frames.lower(particles, whole(grid), table, settings, 1, **step).compile().compiled.memory_analysis()
+
+        def height(x, particles=particles, grid=grid, table=table, settings=settings):
+            moved = eqx.tree_at(lambda p: p.x, particles, x)
+            return rollout(moved, grid, table, settings, frames=1, frame_dt=32 * DT, gravity=DOWN)[0].x.sum()
+
+        back = jax.jit(jax.grad(height)).lower(particles.x).compile().memory_analysis()
+        jax.block_until_ready(rollout(particles, grid, table, settings, frames=1, frame_dt=32 * DT, gravity=DOWN)[0].x)
+        total = [(m.temp_size_in_bytes + m.output_size_in_bytes) / count for m in (used, back)]
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+        print(f"| {count // 1000}k/{nodes}³ | {total[0]:.0f} | {total[1]:.0f} | {peak} |", flush=True)
+
+
+PARTS = {part.__name__: part for part in (speed, laws, gradient, domain, features, batch, memory)}
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--laws", nargs="+", default=list(NUMBERS), choices=list(NUMBERS))
-    parser.add_argument("--cases", nargs="+", default=["10000/64", "100000/64"], help="particles/nodes per side")
-    parser.add_argument("--steps", type=int, default=20)
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("parts", nargs="*", metavar="part", help=", ".join(PARTS))
+    parser.add_argument("--rivals", help="Python with Taichi and Warp")
+    parser.add_argument("--peers", default="../shared/peers", help="folder of the rivals' scripts")
     arguments = parser.parse_args()
-    print(f"jax {jax.__version__}, {jax.devices()[0].platform}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
-    for law in arguments.laws:
-        for case in arguments.cases:
-            count, nodes = map(int, case.split("/"))
-            bench(law, count, nodes, arguments.steps, arguments.repeats)
+    print(machine(), f"load {os.getloadavg()[0]:.1f}")
+    for name in arguments.parts or PARTS:
+        print(f"\n{PARTS[name].__doc__}\n")
+        PARTS[name](arguments)
 
 
 if __name__ == "__main__":

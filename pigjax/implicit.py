@@ -9,7 +9,7 @@ theorem.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,7 +26,8 @@ from pigjax.substep import Scene, Setting, boundaries, free_velocity, parameters
 from pigjax.transfers import add_windows, distances, first_nodes, from_windows, stage, take_windows, to_windows
 
 _HALVINGS = 6  # of a Newton step that makes things worse
-_STALLED = 0.7  # share of the residual that a step must leave less of, for another to be worth it
+_GROWTH = 4.0  # of the residual that a Newton step may bring
+_PATIENCE = 3  # Newton steps without gain
 _FORCING = 0.05  # residual of the Krylov solve of a Newton step, relative to its right-hand side
 _EXACT = 1e-8  # the same where derivatives are wanted
 
@@ -60,9 +61,13 @@ def balanced_velocity(
         """Velocities that the stresses at the end of the step lead to, with nothing in the way."""
         return guess + scene.dt / mass * force(v)
 
+    def led(v):
+        """Velocities after a step down the imbalance of momentum, short enough for the stiffness."""
+        return v + mass / scale * (pushed(v) - v)
+
     def residual(v):
-        """Momentum [kg m/s] by which v misses what it leads to."""
-        return mass * (v - limit(pushed(v)))
+        """Momentum [kg m/s] by which v misses its balance, within what is allowed."""
+        return scale * (v - limit(led(v)))
 
     def size(momentum):
         return jnp.sqrt((momentum**2 / scale).sum())
@@ -72,9 +77,9 @@ def balanced_velocity(
 
     def direction(v, r):
         """Newton's, with what is in the way now: fixed where it is, and a symmetric problem in what it leaves free."""
-        _, free = jax.linearize(limit, pushed(v))
+        _, free = jax.linearize(limit, led(v))
         _, change_of_force = jax.linearize(force, v)
-        fixed = (free(r) - r) / mass
+        fixed = (free(r) - r) / scale
         right = free(scene.dt * change_of_force(fixed) - r)
 
         def apply(d):
@@ -89,18 +94,20 @@ def balanced_velocity(
         enough = setting.newton_tolerance * drive + size(jnp.broadcast_to(rounding * stiffness, start.shape))
 
         def unfinished(carry):
-            step, _, r, gain = carry
-            return ~everywhere((size(r) <= enough) | (gain > _STALLED) | (step >= setting.newton_steps))
+            step, _, _, best, last = carry
+            return ~everywhere((best.size <= enough) | (step >= setting.newton_steps) | (step - last > _PATIENCE))
 
         def improve(carry):
-            step, v, r, _ = carry
-            least = size(r)
+            step, v, r, best, last = carry
             v, r = _backtrack(function, size, v, r, direction(v, r))
-            return step + 1, v, r, size(r) / least
+            found = _Best(v, size(r))
+            better = found.size < best.size
+            best = jax.tree.map(lambda new, old: jnp.where(better, new, old), found, best)
+            return step + 1, v, r, best, jnp.where(better, step + 1, last)
 
-        r = function(start)
-        _, v, r, _ = lax.while_loop(unfinished, improve, (jnp.zeros((), int), start, r, jnp.zeros((), start.dtype)))
-        return v, size(r) <= enough
+        r, none = function(start), jnp.zeros((), int)
+        best = lax.while_loop(unfinished, improve, (none, start, r, _Best(start, size(r)), none))[3]
+        return best.v, (best.size <= enough).astype(start.dtype)  # a float: custom_root wants a tangent of it
 
     def tangent_solve(apply, right):
         exact = partial(solve, tolerance=_EXACT, method=bicgstab)
@@ -110,16 +117,24 @@ def balanced_velocity(
     # what is in the way meets the impulse that v would not bear; in free directions its rounding is not let in
     way = pushed(v)
     _, free = jax.linearize(limit, way)
-    return boundaries(setting, scene, v + (way - v) - free(way - v), time=time), converged
+    return boundaries(setting, scene, v + (way - v) - free(way - v), time=time), lax.stop_gradient(converged) > 0
+
+
+class _Best(NamedTuple):
+    v: Nodes
+    size: Float[Array, ""]  # of the residual
 
 
 def _backtrack(function, size, start, r, direction):
-    """The longest of halved steps that lessens the residual r, or none."""
-    least = size(r)
+    """The longest of halved steps that does not make the residual r much larger, or none.
+
+    Some growth is let pass: which nodes touch a collider changes on the way to the balance.
+    """
+    most = _GROWTH * size(r)
 
     def too_far(carry):
         halvings, _, r = carry
-        return ~everywhere((size(r) < least) | (halvings >= _HALVINGS))
+        return ~everywhere((size(r) < most) | (halvings >= _HALVINGS))
 
     def halve(carry):
         halvings, _, _ = carry
@@ -128,8 +143,8 @@ def _backtrack(function, size, start, r, direction):
 
     v = start + direction
     _, v, new = lax.while_loop(too_far, halve, (jnp.zeros((), int), v, function(v)))
-    better = size(new) < least
-    return jnp.where(better, v, start), jnp.where(better, new, r)
+    fine = size(new) < most
+    return jnp.where(fine, v, start), jnp.where(fine, new, r)
 
 
 def _forces(setting, scene, states, v):

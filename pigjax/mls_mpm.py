@@ -25,7 +25,7 @@ from pigjax.materials import MaterialTable
 from pigjax.matter import Grid, Health, Particles, SimConfig, StepHealth, Trajectory
 
 __all__ = ["SimConfig", "choose_integrator", "choose_substeps", "rollout", "stable_dt", "step"]
-_COST_OF_IMPLICIT = 500  # explicit steps in the time of an implicit one, by benchmarks/bench_implicit.py
+_COST_OF_IMPLICIT = 3000  # explicit steps in the time of an implicit one, by benchmarks/bench_implicit.py
 Vector = Float[Array, "3"] | Sequence[float | int] | np.ndarray
 
 
@@ -150,6 +150,11 @@ def rollout(
             raise InputError(
                 "rollout is traced by jit, grad or vmap and cannot choose its substeps: give SimConfig(substeps=...);"
                 " choose_substeps finds the number from concrete values."
+            )
+        if config.integrator == "auto":
+            raise InputError(
+                "rollout is traced by jit, grad or vmap and cannot choose its integrator: give SimConfig one, or what"
+                " choose_integrator finds from concrete values."
             )
         dt = jnp.asarray(frame_dt) / substeps
         return _on_whole_grid(particles, grid, table, config, dt, (gravity, colliders, contact), frames, substeps)

@@ -124,7 +124,7 @@ def test_a_stopped_rollout_gives_back_its_last_good_frame():
     config = SimConfig(substeps=1, stop=True, force=True)
     limit = float(stable_dt(TABLE, small, max_speed=1.0, cfl=1.0))
     end, path, health = rollout(
-        particles, small, TABLE, config, frames=30, frame_dt=5 * limit, gravity=(0.0, 0.0, -9.8), colliders=(FLOOR,)
+        particles, small, TABLE, config, frames=30, frame_dt=4.0 * limit, gravity=(0.0, 0.0, -9.8), colliders=(FLOOR,)
     )
     bad = int(health.first_bad_frame)
     print("bad in frame", bad, health.problems())

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from pigjax import linalg
+from pigjax.arrays import everywhere
 from pigjax.materials.tensors import (
     Scalars,
     Tensors,
@@ -85,7 +86,7 @@ def left_stretch(F: Tensors, b: Tensors, J: Scalars) -> Tensors:
         return product(jnp.moveaxis(rotation, (-2, -1), (0, 1)), transpose(F))
 
     ill = determinant_of_sums < _ILL_CONDITIONED * first**3
-    return lax.cond(jnp.any(ill), lambda: jnp.where(ill, by_polar(), closed_form()), closed_form)
+    return lax.cond(~everywhere(~jnp.any(ill)), lambda: jnp.where(ill, by_polar(), closed_form()), closed_form)
 
 
 def _first_invariant(b: Tensors, J: Scalars) -> Scalars:

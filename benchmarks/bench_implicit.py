@@ -1,0 +1,81 @@
+"""Explicit against implicit steps over Young's modulus: `python benchmarks/bench_implicit.py [--young 1e3 ...]`.
+
+A block of 5 cells a side is thrown at 1 m/s along a frictional floor and settles on it, for 0.1 s in frames of 1/40 s.
+Errors are the farthest particle's, relative to the longest way, against explicit float64 steps of half the stable
+length. Seconds are per simulated second, warm, on one device.
+"""
+
+import argparse
+import math
+import os
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _timing import machine
+
+from pigjax.colliders import Plane
+from pigjax.materials import Material, material_table
+from pigjax.matter import Grid, make_particles
+from pigjax.mls_mpm import SimConfig, choose_integrator, choose_substeps, rollout
+
+DX, FRAMES, FRAME_DT = 1 / 16, 4, 1 / 40
+GRAVITY = (0.0, 0.0, -9.8)
+
+
+def block(young, dtype):
+    axis = DX / 2 * (np.arange(10) + 0.5)
+    x = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3) + np.array([5, 5.5, 4]) * DX
+    table = material_table([Material("neo_hookean", density=1000.0, young=young, poisson=0.3)])
+    velocity = jnp.asarray([1.0, 0, 0], dtype)
+    particles = make_particles(jnp.asarray(x, dtype), volume=(DX / 2) ** 3, table=table, velocity=velocity)
+    top = jnp.asarray([0, 0, 4 * DX + 1e-4], dtype)
+    floor = Plane(point=top, normal=jnp.asarray([0, 0, 1], dtype), friction=jnp.asarray(0.3, dtype))
+    return particles, Grid(jnp.zeros(3, dtype), jnp.asarray(DX, dtype), (24, 16, 16)), table, floor
+
+
+def run(young, dtype, **config):
+    """End, start, seconds of a warm run, substeps per frame and health."""
+    particles, grid, table, floor = block(young, dtype)
+    settings = SimConfig(devices=1, **config)
+
+    def once():
+        steps = {"frames": FRAMES, "frame_dt": FRAME_DT, "gravity": GRAVITY, "colliders": (floor,)}
+        return jax.block_until_ready(rollout(particles, grid, table, settings, **steps))
+
+    once()
+    begun = time.perf_counter()
+    end, _, health = once()
+    return end.x, particles.x, time.perf_counter() - begun, int(health.substeps), health
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--young", nargs="+", type=float, default=[1e3, 1e5, 1e7, 1e8, 1e9])
+    parser.add_argument("--substeps", nargs="+", type=int, default=[1, 4, 16], help="implicit steps per frame")
+    arguments = parser.parse_args()
+    print(machine(), f"load {os.getloadavg()[0]:.1f}\n")
+    print("| E Pa | integrator | substeps per frame | s per simulated s | error | not converged | auto takes |")
+    print("|---|---|---|---|---|---|---|")
+    for young in arguments.young:
+        with jax.enable_x64(True):
+            particles, grid, table, floor = block(young, np.float64)
+            steps = {"frames": FRAMES, "frame_dt": FRAME_DT, "gravity": GRAVITY, "colliders": (floor,)}
+            stable = choose_substeps(particles, grid, table, SimConfig(), **steps)
+            auto = choose_integrator(particles, grid, table, SimConfig(integrator="auto"), **steps).integrator
+            exact, start, *_ = run(young, np.float64, substeps=2 * stable)
+            exact, way = np.asarray(exact), np.abs(exact - start).max()
+        for integrator, substeps in (("explicit", stable), *(("implicit", n) for n in arguments.substeps)):
+            end, _, seconds, taken, health = run(young, np.float32, integrator=integrator, substeps=substeps)
+            error = np.abs(np.asarray(end, np.float64) - exact).max() / way
+            rate = seconds / (FRAMES * FRAME_DT)
+            print(
+                f"| {young:.0e} | {integrator} | {taken} | {rate:.2f} | {error:.1e} |"
+                f" {int(health.unconverged) if math.isfinite(error) else 'broke down'} | {auto} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
