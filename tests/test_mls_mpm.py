@@ -326,44 +326,56 @@ def test_visual_deformation_is_total_and_bounded():
     assert float(stretches.max()) < 1.1 + 1e-5
 
 
-def final_state(model, young, poisson, density, velocity, gravity):
-    """A number that everything in a short flight of an elastic cube bears on."""
-    table = table_of(model, young=young, poisson=poisson, density=density)
-    p = cube(table, velocity=velocity)
-    p = eqx.tree_at(lambda p: p.F, p, p.F * jnp.asarray([0.9, 1.1, 1.0]))
+def final_state(model, inputs):
+    """A number that everything in a short flight of a cube bears on."""
+    numbers = {name: inputs[name] for name in inputs if name not in ("x", "velocity", "gravity")}
+    table = table_of(model, **numbers)
+    p = cube(table, velocity=inputs["velocity"])
+    p = eqx.tree_at(lambda p: (p.x, p.F), p, (p.x + inputs["x"], p.F * jnp.asarray([0.9, 1.1, 1.0])))
     end, path, _ = rollout(
-        p, grid(), table, SimConfig(substeps=6), frames=2, frame_dt=12e-3, gravity=gravity, colliders=(FLOOR,)
+        p, grid(), table, SimConfig(substeps=6), frames=2, frame_dt=12e-3, gravity=inputs["gravity"], colliders=(FLOOR,)
     )
     weights = jnp.cos(jnp.arange(end.x.size)).reshape(end.x.shape)
     return (weights * (end.x + 0.1 * path.x[0])).sum() + (weights[:, :, None] * end.F).sum() * 0.01
 
 
 FLOOR = Plane(np.array([0.0, 0.0, 0.45]), np.array([0.0, 0.0, 1.0]), mode="slip")
+ELASTIC = {"young": 2e4, "poisson": 0.3}
+DIFFERENTIATED = {
+    "neo_hookean": ELASTIC,
+    "fixed_corotated": ELASTIC,
+    "fluid": {"bulk_modulus": 2e4, "viscosity": 0.5},
+    "von_mises": ELASTIC | {"yield_stress": 300.0, "hardening_modulus": 1e3},
+    "drucker_prager": ELASTIC | {"friction_angle": 0.5, "cohesion": 10.0},
+}
 
 
-@pytest.mark.parametrize("model", ["neo_hookean", "fixed_corotated"])
+@pytest.mark.parametrize("model", DIFFERENTIATED)
 def test_reverse_mode_through_a_rollout_equals_central_differences(x64, model):
-    inputs = (2e4, 0.3, 1e3, jnp.asarray([0.3, 0.2, -0.5]), jnp.asarray([0.5, -1.0, -9.8]))
-    inputs = tuple(jnp.asarray(v) for v in inputs)
-    value = jax.jit(partial(final_state, model))
-    gradient = jax.jit(jax.grad(partial(final_state, model), argnums=(0, 1, 2, 3, 4)))(*inputs)
-    rng = np.random.default_rng(5)
-    for i, name in enumerate(["young", "poisson", "density", "velocity", "gravity"]):
-        direction = rng.normal(size=inputs[i].shape) * np.maximum(np.abs(inputs[i]), 0.1)
+    """To 1e-5, by all numbers of the matter, its places and velocities, and gravity. Where matter yields, the number
+    has kinks that differences of any width may straddle; 1e-4 holds here."""
+    inputs = {name: jnp.asarray(value) for name, value in DIFFERENTIATED[model].items()}
+    inputs |= {"density": jnp.asarray(1e3), "velocity": jnp.asarray([0.3, 0.2, -0.5])}
+    inputs |= {"gravity": jnp.asarray([0.5, -1.0, -9.8]), "x": jnp.zeros((SIDE**3, 3))}
+    value, gradient = jax.jit(partial(final_state, model)), jax.jit(jax.grad(partial(final_state, model)))(inputs)
+    rng, worst = np.random.default_rng(5), 0.0
+    for name, at in inputs.items():
+        direction = rng.normal(size=at.shape) * (1e-2 * DX if name == "x" else np.maximum(np.abs(at), 0.1))
         h = 1e-4
-        shifted = [value(*(v + s * h * direction if j == i else v for j, v in enumerate(inputs))) for s in (1, -1)]
+        shifted = [value(inputs | {name: at + sign * h * direction}) for sign in (1, -1)]
         expected = (shifted[0] - shifted[1]) / (2 * h)
-        got = (gradient[i] * direction).sum()
+        got = (gradient[name] * direction).sum()
         print(f"{model} d/d{name}: {float(got):.6e}, central differences {float(expected):.6e}")
-        np.testing.assert_allclose(got, expected, rtol=1e-5)
+        worst = max(worst, abs(float(got - expected)) / abs(float(expected)))
+    assert worst < (1e-5 if model in ("neo_hookean", "fixed_corotated", "fluid") else 1e-4)
 
 
 def test_simulations_can_be_batched_over_materials(x64):
+    inputs = {"poisson": 0.3, "density": 1e3, "velocity": jnp.asarray([0.3, 0.2, -0.5]), "x": 0.0}
+    inputs |= {"gravity": jnp.asarray([0.5, -1.0, -9.8])}
     young = jnp.asarray([1e4, 3e4])
-    fixed = (0.3, 1e3, jnp.asarray([0.3, 0.2, -0.5]), jnp.asarray([0.5, -1.0, -9.8]))
-    batch = jax.jit(jax.vmap(lambda e: final_state("neo_hookean", e, *fixed)))(young)
-    alone = jax.jit(lambda e: final_state("neo_hookean", e, *fixed))
-    np.testing.assert_allclose(batch, [alone(e) for e in young], rtol=1e-10)
+    end = jax.jit(lambda e: final_state("neo_hookean", inputs | {"young": e}))
+    np.testing.assert_allclose(jax.jit(jax.vmap(end))(young), [end(e) for e in young], rtol=1e-10)
 
 
 def equations(jaxpr, *, into_branches=True):
