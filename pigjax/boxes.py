@@ -34,14 +34,19 @@ def run_in_boxes(
         return run_frames(particles, box, table, config, devices, start=start, frames=frames, **step)[:3]
     fit = Fit()
     duration = step["dt"] * step["substeps"]
-    paths, healths = [], []
+    paths: list[Trajectory] = []
+    healths: list[Health] = []
     for frame in range(frames):
+        before = particles
         particles, path, health = fit.frame(
             particles, domain, table, config, devices, start=duration * frame, frames=1, **step
         )
+        stops = config.stop and health.first_bad_frame >= 0
+        if stops and paths:  # the last good frame to the digit, where a box's origin would round it anew
+            particles, path = before, paths[-1]
         paths.append(path)
         healths.append(health)
-        if config.stop and health.first_bad_frame >= 0:
+        if stops:
             paths += [path] * (frames - frame - 1)
             break
     joined = jax.tree.map(lambda *pieces: jnp.concatenate(pieces), *paths)
