@@ -137,6 +137,26 @@ def test_one_bad_particle_is_counted_once_and_moves_no_other(field, value, count
         np.testing.assert_allclose(a, b, atol=2e-6 if name == "x" else 1e-4)
 
 
+@pytest.mark.parametrize("stretches", [(0, 0, 0), (1, 1, -0.2), (-1, -1, -1), (1, 0, 0)])
+def test_one_particle_flat_or_inside_out_is_counted_and_does_not_blow_up_the_others(stretches):
+    """It gives them no more energy than it takes to squeeze its volume to nothing: speeds stay far below waves'."""
+    table = table_of()
+    dt = stable_dt(table, grid_of(), max_speed=1.0)
+    end, path, health = run(put(matter(table), "F", jnp.diag(jnp.asarray(stretches, float))), table, dt=dt)
+    assert (int(health.inverted), int(health.nonfinite), int(health.escaped)) == (1, 0, 0)
+    fastest = float(np.abs(path.v).max() / table.wave_speed.max())
+    print(f"stretches {stretches}: fastest {fastest:.3f} of the speed of waves, det F {np.linalg.det(end.F[7]):.2g}")
+    assert fastest < 0.2
+
+
+def test_a_fluid_particle_inside_out_starts_anew_at_rest():
+    m = material_table([Material("fluid", density=1e3, bulk_modulus=1e5)]).rows(0)
+    F = jnp.moveaxis(jnp.stack([0 * jnp.eye(3), -jnp.eye(3), jnp.diag(jnp.asarray([1.0, 1.0, -0.2]))]), 0, -1)
+    answer = respond("fluid", F, jnp.zeros_like(F), 0.0, None, m)
+    np.testing.assert_allclose(answer.F, jnp.eye(3)[..., None] * jnp.ones(3), atol=1e-6)
+    np.testing.assert_allclose(answer.stress, 0.0, atol=1e-6)
+
+
 def test_particles_at_the_wall_are_not_harmed_by_one_far_outside():
     x = lattice((3.0 * DX, 0.5, 0.5))
     at_rest = matter(table_of(), x)
