@@ -34,14 +34,19 @@ def run_in_boxes(
         return run_frames(particles, box, table, config, devices, start=start, frames=frames, **step)[:3]
     fit = Fit()
     duration = step["dt"] * step["substeps"]
-    paths, healths = [], []
+    paths: list[Trajectory] = []
+    healths: list[Health] = []
     for frame in range(frames):
+        before = particles
         particles, path, health = fit.frame(
             particles, domain, table, config, devices, start=duration * frame, frames=1, **step
         )
+        stops = config.stop and health.first_bad_frame >= 0
+        if stops and paths:  # the last good frame to the digit, where a box's origin would round it anew
+            particles, path = before, paths[-1]
         paths.append(path)
         healths.append(health)
-        if config.stop and health.first_bad_frame >= 0:
+        if stops:
             paths += [path] * (frames - frame - 1)
             break
     joined = jax.tree.map(lambda *pieces: jnp.concatenate(pieces), *paths)
@@ -84,7 +89,9 @@ class Fit:
             low, high = np.asarray(met).T
             size, first = np.array(box.grid.shape), np.asarray(box.low)
             inner = (low & (first > 0)) | (high & (first + size < np.array(domain.shape)))
-            if not inner.any():
+            # what crosses the box in one step, or is NaN, has broken down: no larger box would hold it
+            broken = not health.max_courant < max(self.shape)
+            if broken or not inner.any():
                 return moved, path, health
             self.slack *= 2
 
@@ -98,12 +105,12 @@ class Fit:
         high = np.ceil(cells.max(0) + self.slack).astype(int) + 1
         needed = high - low + 1
         shape = np.array(self.shape)
-        wasteful = np.prod(shape) > max(8 * np.prod(needed), 4 * len(ahead))
+        wasteful = _nodes(shape) > max(8 * _nodes(needed), 4 * len(ahead))
         if (needed > shape).any() or wasteful:
             room = [round_up_size(int(n * _ROOM)) for n in needed]
             shape = np.array(room) if wasteful else np.maximum(room, shape)
         shape = np.minimum(shape, sides)
-        if (nodes := int(np.prod(shape))) > _LARGEST:
+        if (nodes := _nodes(shape)) > _LARGEST:
             raise SimulationError(
                 f"matter has spread so far that its grid needs {nodes:.2g} nodes (at most {_LARGEST:.2g}); catch what"
                 " falls with a plane, or take a coarser grid."
@@ -114,6 +121,11 @@ class Fit:
         origin = np.asarray(domain.origin, np.float64) + low * float(domain.dx)
         grid = Grid(jnp.asarray(origin, domain.origin.dtype), domain.dx, self.shape)
         return Box(grid, jnp.asarray(low, jnp.int32), jnp.asarray(sides, jnp.int32))
+
+
+def _nodes(shape):
+    """Their number, in integers without limit."""
+    return math.prod(map(int, shape))
 
 
 def _ways(particles, duration, gravity):

@@ -85,8 +85,8 @@ def run_frames(
         contact=contact,
         specific_volume=None if contact is None else _specific_volume(particles, contact.bodies) / grid.dx**3,
         frozen=None if still is None else touched_nodes(grid, still.x, kernel),
-        unit_mass=lax.stop_gradient(particles.mass.max()),
-        go=everywhere(particles.volume0[0] > -1),
+        unit_mass=lax.stop_gradient(jnp.where(jnp.isfinite(particles.mass), particles.mass, 0).max()),
+        go=everywhere(~(particles.volume0[0] < -jnp.finfo(dtype).max)),  # true of NaN too
     )
     setting = Setting(
         kernel=kernel,
@@ -116,7 +116,7 @@ def run_frames(
     back = [jnp.argsort(order) for order in orders]
     states = tuple(_take(state, order) for state, order in zip(states, back))
     paths = tuple(_take(path, order, 1) for path, order in zip(paths, back))
-    return grouping.particles(states, grid), grouping.path(paths, grid), health, met
+    return grouping.particles(states, grid), grouping.path(paths, grid, frames), health, met
 
 
 def _frames(setting, config, frames, substeps, scene, states, start, nothing):
@@ -145,7 +145,7 @@ def _frames(setting, config, frames, substeps, scene, states, start, nothing):
         if config.stop:
             stopped = stopped | bad
             moved = jax.tree.map(lambda new, old: jnp.where(stopped, old, new), moved, states)
-        seen = tuple(s._replace(C=None, stress=None, mass=None, hardening=None, row=None) for s in moved)
+        seen = tuple(s._replace(rounded=None, C=None, stress=None, mass=None, hardening=None, row=None) for s in moved)
         return (moved, worst.worse(watch), steps, stopped), (seen, bad)
 
     carry = (states, nothing, jnp.zeros((), int), jnp.zeros((), bool))

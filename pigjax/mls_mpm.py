@@ -143,6 +143,7 @@ def rollout(
     """
     _check_table(particles, table)
     _check_contact(particles, config, contact)
+    _check_steps(frames, frame_dt, gravity)
     substeps = config.substeps
     steps: dict[str, Any] = {"frames": frames, "frame_dt": frame_dt, "gravity": gravity, "colliders": colliders}
     if _is_traced(particles, grid, table, frame_dt, gravity, colliders, contact):
@@ -209,7 +210,7 @@ def _is_traced(*trees: Any) -> bool:
 
 
 def _max_speed(particles, colliders, grid, duration):
-    speeds = np.linalg.norm(np.asarray(particles.v), axis=-1)
+    speeds = np.linalg.norm(np.asarray(particles.v, np.float64), axis=-1)
     ends = np.array(list(np.ndindex(2, 2, 2))) * (np.array(grid.shape) - 1)
     corners = jnp.asarray(grid.origin + grid.dx * ends)
     own = [float(c.top_speed(corners, duration)) for c in colliders if c.moves]
@@ -221,6 +222,17 @@ def _check_table(particles, table):
         raise InputError(
             f"The material table has {len(table)} rows, the particles were made for one of {len(particles.counts)}."
         )
+
+
+def _check_steps(frames, frame_dt, gravity):
+    if frames < 1:
+        raise InputError(f"frames = {frames}: must be 1 or more.")
+    if _is_traced(frame_dt, gravity):
+        return
+    if not (math.isfinite(frame_dt) and frame_dt >= 0):
+        raise InputError(f"frame_dt = {frame_dt}: the time between frames must be >= 0 s, and finite.")
+    if not np.isfinite(np.asarray(gravity)).all():
+        raise InputError(f"gravity = {gravity}: its components must be finite [m/s²].")
 
 
 def _check_contact(particles, config, contact):

@@ -113,7 +113,7 @@ def _to_grid(setting, scene, states):
     """Mass and momentum of the nodes [nx ny nz 4], with the impulse of the present stress in explicit steps."""
     give = Pass(partial(_give, setting, scene.nodes), setting.kernel, scene.nodes)
     shared = (scene.dt, scene.grid.dx)
-    total: Array | float = 0.0
+    total = jnp.zeros((*scene.nodes, 4), scene.dt.dtype)
     for state in states:
         given = (state.v, state.C, state.stress, state.mass, state.volume)
         total = total + scatter_chunks(give, scene.go, state.cells, given, shared, ruled=setting.ruled)
@@ -155,13 +155,13 @@ def _check(shape, bodies, state, before, volume, dt, dx):
         start = jnp.floor(before[:1] / width) * width * np.eye(3, 1, dtype=before.dtype)
         low, high = low + start, high + start
     held = jnp.clip(state.cells, low, high)
-    alive = volume[0] > 0
-    J = determinant(by_component(state.F))
+    J, speed = determinant(by_component(state.F)), jnp.sqrt((state.v**2).sum(0))
+    alive = (volume[0] > 0) & ~jnp.isnan(J) & ~jnp.isnan(speed)  # what is not is counted as such
     out = jnp.stack([state.cells < held, state.cells > held], 1) & alive
     watch = Watch(
         health=StepHealth(
             min_J=jnp.where(alive, J, jnp.inf).min(),
-            max_courant=jnp.sqrt(jnp.where(alive, (state.v**2).sum(0), 0.0).max()) * dt / dx,
+            max_courant=jnp.where(alive, speed, 0.0).max() * dt / dx,
             escaped=out.any((0, 1)).sum(),
             nonfinite=jnp.zeros((), int),
             inverted=(alive & (J <= 0)).sum(),
@@ -182,8 +182,11 @@ def _respond(law, state, v, per_cell, dt, dx, parameters):
     visual = state.visual
     if visual is not None:
         visual = visual + by_row(dt * product(rate, by_component(visual)))
+    way = dt / dx * v - state.rounded
+    cells = state.cells + way
     return state._replace(
-        cells=state.cells + dt / dx * v,
+        cells=cells,
+        rounded=lax.stop_gradient((cells - state.cells) - way),
         v=v,
         C=by_row(rate),
         F=by_row(F),

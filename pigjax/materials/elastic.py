@@ -39,22 +39,32 @@ def fixed_corotated(F: Tensors, m) -> Tensors:
 
 
 def neo_hookean(F: Tensors, m) -> Tensors:
-    """τ = μ (F Fᵀ − I) + λ log J I (Bonet and Wood 2008, eq. 6.28); J is floored at 0.01.
+    """τ = μ (F Fᵀ − I) + λ log J I (Bonet and Wood 2008, eq. 6.28); J is floored at 0.01, see `_orientation`.
 
     Ψ = μ/2 (tr FᵀF − 3) − μ log J + λ/2 log² J.
     """
-    eye = identity(F)
-    J = jnp.maximum(determinant(F), _SMALLEST_STRETCH)
-    return m.mu * (product(F, transpose(F)) - eye) + m.lam * jnp.log(J) * eye
+    J = determinant(F)
+    barrier = m.lam * jnp.log(jnp.maximum(J, _SMALLEST_STRETCH)) - m.mu
+    return m.mu * product(F, transpose(F)) + barrier * _orientation(J) * identity(F)
 
 
 def stvk_hencky(F: Tensors, m) -> Tensors:
     """τ = U (2μ ε + λ tr ε I) Uᵀ with ε = log Σ, St. Venant–Kirchhoff in Hencky strain (Klar et al. 2016, sec. 6.1).
 
-    Ψ = μ ‖ε‖² + λ/2 tr²ε. Needs the singular value decomposition F = U Σ Vᵀ.
+    Ψ = μ ‖ε‖² + λ/2 tr²ε. Needs the singular value decomposition F = U Σ Vᵀ. Stretches are floored at 0.01, see
+    `_orientation`.
     """
     u, s, _ = svd(F)
-    return spectral(u, hencky_stress(hencky_strain(s), m))
+    return spectral(u, hencky_stress(hencky_strain(s), m) * _orientation(s[2]))
+
+
+def _orientation(measure: Scalars) -> Scalars:
+    """1 for matter right side out, 0 where it is flat, −1 where it is inside out by more than the floor of logarithms.
+
+    What is inside out pulls itself together. Were its pressure kept, it would push its surroundings apart without end,
+    since F grows and shrinks by factors and turns no more.
+    """
+    return jnp.where(measure > 0, 1.0, jnp.maximum(measure / _SMALLEST_STRETCH, -1.0))
 
 
 def hencky_strain(stretches):

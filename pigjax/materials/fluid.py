@@ -22,6 +22,10 @@ def newtonian(J: Scalars, rate: Tensors, m) -> Tensors:
 
 
 def volume_ratio(J: Scalars, rate: Tensors, dt) -> Scalars:
-    """J after a step, J (1 + dt tr ∇v): the determinant of I + dt ∇v would let mere rotation create volume."""
+    """J after a step, J (1 + dt tr ∇v): the determinant of I + dt ∇v would let mere rotation create volume.
+
+    From no volume at all, or less, it starts anew at rest: pressed to the least volume it would burst.
+    """
+    J = jnp.where(J > 0, J, 1.0)
     divergence = rate[0, 0] + rate[1, 1] + rate[2, 2]
     return jnp.clip(J * (1 + dt * divergence), 0.1, _LARGEST_VOLUME)

@@ -142,7 +142,7 @@ class MaterialTable(Parameters):
     def __len__(self) -> int:
         return len(self.laws)
 
-    def rows(self, index: int | Int[Array, "*p"]) -> Parameters:
+    def rows(self, index: int | Int[Array, "*p"] | Int[np.ndarray, "*p"]) -> Parameters:
         """Numbers of one row, or of the row of each particle."""
         return Parameters(**{f.name: getattr(self, f.name)[index] for f in fields(Parameters)})
 

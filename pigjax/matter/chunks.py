@@ -22,6 +22,7 @@ class State(NamedTuple):
     """What a simulation holds of the particles of one law: rows of `[p rows]`, or in chunks `[n rows c]`."""
 
     cells: Rows  # position in cells from the first node, 3 rows
+    rounded: Rows  # what rounding has added to the cells so far, 3 (Kahan 1965, doi 10.1145/363707.363723)
     v: Rows  # [m/s], 3
     C: Rows  # velocity gradient [1/s], 9
     F: Rows  # elastic deformation gradient, 9

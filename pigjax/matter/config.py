@@ -18,7 +18,7 @@ class SimConfig(eqx.Module):
     """Every choice of the simulation that is compiled in.
 
     Raises:
-        InputError: a choice does not exist.
+        InputError: a choice does not exist or a number is out of range.
     """
 
     kernel: str = static_field(default="quadratic")  # or "cubic": smoother, 2.4 times as many nodes
@@ -47,6 +47,12 @@ class SimConfig(eqx.Module):
                 raise InputError(f"SimConfig.{name} = {value!r}: choose one of {', '.join(choices)}.")
         if self.substeps is not None and self.substeps < 1:
             raise InputError(f"SimConfig.substeps = {self.substeps}: must be 1 or more.")
+        if self.chunk is not None and self.chunk < 1:
+            raise InputError(f"SimConfig.chunk = {self.chunk}: must be 1 or more.")
+        if not 0 < self.visual_stretch[0] <= self.visual_stretch[1]:
+            raise InputError(
+                f"SimConfig.visual_stretch = {self.visual_stretch}: the bounds must be > 0, the lower one first."
+            )
         if not self.cfl > 0:
             raise InputError(f"SimConfig.cfl = {self.cfl}: must be > 0.")
         if self.devices is not None and not 1 <= self.devices <= jax.local_device_count():

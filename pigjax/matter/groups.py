@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from pigjax import linalg
+from pigjax.errors import InputError
 from pigjax.materials import LAWS, MaterialTable, Parameters, respond
 from pigjax.matter.chunks import State
 from pigjax.matter.state import Grid, Particles, Trajectory
@@ -47,7 +48,7 @@ class Grouping(NamedTuple):
         ]
         return jax.tree.map(lambda *pieces: self._merge(pieces), *moved)
 
-    def path(self, paths: tuple[State, ...], grid: Grid) -> Trajectory:
+    def path(self, paths: tuple[State, ...], grid: Grid, frames: int) -> Trajectory:
         """Trajectory of all particles from states with an axis of frames before that of particles."""
         remaining = iter(paths)
         pieces = []
@@ -61,7 +62,6 @@ class Grouping(NamedTuple):
                 )
             else:
                 pieces.append((part.x[None], part.v[None], part.F_visual[None]))
-        frames = max(x.shape[0] for x, _, _ in pieces)
         full = [[jnp.broadcast_to(a, (frames, *a.shape[1:])) for a in piece] for piece in pieces]
         return Trajectory(*(self._merge(arrays, axis=1) for arrays in zip(*full)))
 
@@ -76,7 +76,15 @@ def group_by_law(
     """Particles by law.
 
     The sizes are static, from `particles.counts`, made whole multiples of `pieces` by particles without mass.
+
+    Raises:
+        InputError: `particles.counts` does not add up to the particles.
     """
+    if sum(particles.counts) != len(particles):
+        raise InputError(
+            f"Particles.counts = {particles.counts} adds up to {sum(particles.counts)}, but there are {len(particles)}"
+            " particles: make a part of them by make_particles, which counts anew."
+        )
     rows_of = {law: [row for row, other in enumerate(table.laws) if other == law] for law in table.laws}
     sizes = {law: sum(particles.counts[row] for row in rows) for law, rows in rows_of.items()}
     laws = [law for law, size in sizes.items() if size]
@@ -117,42 +125,64 @@ def bound_visual(state: State, stretch: tuple[float, float]) -> State:
 
 
 def _group(law, part, rows, table, grid, pieces, apart):
-    """Particles of one law with their present stress, at rest and without mass where they are not finite."""
+    """Particles of one law with their present stress, at rest and without mass where they are not finite.
+
+    Those outside begin half a cell beyond where the wall holds them: near enough for the weights of the kernel, and
+    far enough to be counted.
+    """
     kind, several = LAWS[law], len(rows) > 1
     parameters = table.rows(np.array(rows) if several else rows[0])
     own_row = jnp.searchsorted(jnp.asarray(rows), part.material)
-    leaves = [part.x, part.v, part.F, part.C, part.hardening[:, None]] + ([] if kind.total else [part.F_visual])
-    ok = jnp.isfinite(sum(leaf.reshape(len(part), -1).sum(1) for leaf in leaves))
-
-    def sound(values, safe):
-        values = values.reshape(len(part), -1)
-        return jnp.where(ok[:, None], values, jnp.asarray(safe, values.dtype))
-
+    last = np.array(grid.shape, part.x.dtype) - 1
+    cells = jnp.clip((part.x - grid.origin) / grid.dx, 0.5, last - 0.5)
     eye = np.eye(3).reshape(-1)
-    cells = (part.x - grid.origin) / grid.dx
-    state = State(
-        cells=sound(cells, np.array(grid.shape) / 2) + (_own_grid(part, grid) if apart else 0),
-        v=sound(part.v, 0),
-        C=sound(part.C, 0),
-        F=sound(part.F, eye),
-        stress=jnp.zeros((len(part), 9), part.x.dtype),
-        mass=sound(part.mass, 0),
-        volume=sound(part.volume0, 0),
-        hardening=sound(part.hardening, 0),
-        visual=None if kind.total else sound(part.F_visual, eye),
-        row=own_row.astype(part.x.dtype)[:, None] if several else None,
+    given = State(
+        cells=cells,
+        rounded=jnp.zeros_like(part.x),
+        v=part.v,
+        C=part.C,
+        F=part.F,
+        stress=None,
+        mass=part.mass,
+        volume=part.volume0,
+        hardening=part.hardening,
+        visual=None if kind.total else part.F_visual,
+        row=None,
     )
+    given = jax.tree.map(lambda leaf: leaf.reshape(len(part), -1), given)
+    rest = jax.tree.map(lambda _: 0.0, given)._replace(cells=(last + 1) / 2, F=eye, visual=None if kind.total else eye)
+
+    def sound(state, ok):
+        return jax.tree.map(lambda leaf, safe: jnp.where(ok[:, None], leaf, jnp.asarray(safe, leaf.dtype)), state, rest)
+
+    # x itself too, since its clipped cells are finite where it is infinite
+    ok = _finite((given, part.x)) & (part.mass >= 0) & (part.volume0 > 0)
+    state = sound(given, ok)
     F, rate = by_component(state.F.T), by_component(state.C.T)
     of_each = jax.tree.map(lambda p: p[own_row], parameters) if several else parameters
     inner = state.hardening[:, 0] if kind.hardens else None
     F, inner, stress = respond(law, F, rate, 0.0, inner, of_each)
-    inner = None if inner is None else inner[:, None]
-    state = state._replace(F=by_row(F).T, stress=by_row(stress).T, hardening=inner)
+    inner = state.hardening if inner is None else inner[:, None]
+    state = state._replace(F=by_row(F).T, hardening=inner)
+    stress = by_row(stress).T
+    ok &= _finite((state, stress))
+    state = sound(state, ok)
+    state = state._replace(
+        cells=state.cells + (_own_grid(part, grid) if apart else 0),
+        stress=jnp.where(ok[:, None], stress, 0.0),
+        hardening=state.hardening if kind.hardens else None,
+        row=own_row.astype(part.x.dtype)[:, None] if several else None,
+    )
     padding = -len(part) % pieces
     if padding:
         state = jax.tree.map(lambda rows: jnp.pad(rows, ((0, padding), (0, 0)), mode="edge"), state)
         state = state._replace(**{name: getattr(state, name).at[-padding:].set(0) for name in ("mass", "volume")})
     return Group(law, parameters), state
+
+
+def _finite(trees):
+    """Which particles are finite in every row."""
+    return jnp.isfinite(sum(rows.sum(-1) for rows in jax.tree.leaves(trees)))
 
 
 def _ungroup(part, state, grid, apart):

@@ -14,6 +14,8 @@ from pigjax.arrays import array_field, static_field
 from pigjax.errors import InputError
 from pigjax.materials import MaterialTable
 
+_LONGEST = 1 << 30  # nodes of a side
+_FARTHEST = 2.0**62  # cells that an integer counts
 WALL = 3  # outer nodes on each side of the grid that belong to the wall of the domain
 
 
@@ -44,7 +46,8 @@ class Grid(eqx.Module):
     """A box of nodes. Its outer three nodes on each side are the wall of the domain.
 
     Raises:
-        InputError: a side is too short to hold anything between its walls.
+        InputError: a side is too short to hold anything between its walls, the spacing is not > 0, or a number is not
+            finite.
     """
 
     origin: Float[Array, "3"] = array_field()  # first node [m]
@@ -54,6 +57,10 @@ class Grid(eqx.Module):
     def __check_init__(self):
         if min(self.shape) < 2 * WALL + 2:
             raise InputError(f"Grid.shape = {self.shape}: every side needs {2 * WALL + 2} nodes or more.")
+        if _is_known(self.dx) and not np.all(np.isfinite(self.dx) & (np.asarray(self.dx) > 0)):
+            raise InputError(f"Grid.dx = {self.dx}: the grid spacing must be > 0 m, and finite.")
+        if _is_known(self.origin) and not np.isfinite(self.origin).all():
+            raise InputError(f"Grid.origin = {self.origin}: the first node must have finite coordinates.")
 
     @property
     def points(self) -> Float[Array, "nx ny nz 3"]:
@@ -92,9 +99,13 @@ def make_particles(
         body: number of the body that each belongs to, for `BodyContact`.
 
     Raises:
-        InputError: there are no particles, a volume is not > 0, or a row is not in the table.
+        InputError: x is not [p 3], there are no particles, a volume is not > 0, or a row is not in the table.
     """
     x = jnp.asarray(x)
+    if not jnp.issubdtype(x.dtype, jnp.floating):
+        x = x.astype(float)
+    if x.ndim != 2 or x.shape[1] != 3:
+        raise InputError(f"make_particles got x of shape {x.shape}: positions are [p, 3].")
     count = x.shape[0]
     if count == 0:
         raise InputError("make_particles got no positions: x must hold one particle or more.")
@@ -105,8 +116,10 @@ def make_particles(
         bad = rows.min() if rows.min() < 0 else rows.max()
         raise InputError(f"material = {bad}: the table has rows 0 to {len(table) - 1}.")
     volume = jnp.broadcast_to(jnp.asarray(volume, x.dtype), (count,))
-    if not isinstance(volume, jax.core.Tracer) and not np.all(np.asarray(volume) > 0):
-        raise InputError(f"volume = {np.asarray(volume).min()}: rest volumes must be > 0 m³.")
+    if _is_known(volume):
+        ok = np.isfinite(volume) & (np.asarray(volume) >= np.finfo(volume.dtype).tiny)  # below, XLA takes it for zero
+        if not ok.all():
+            raise InputError(f"volume = {volume[np.argmin(ok)]}: rest volumes must be > 0 m³, and finite.")
     eye = jnp.broadcast_to(jnp.eye(3, dtype=x.dtype), (count, 3, 3))
     return Particles(
         x=x,
@@ -131,14 +144,23 @@ def fit_grid(x: Float[Array, "p 3"] | np.ndarray, dx: float, *, margin: float = 
     has the old shape and always the old lattice.
 
     Raises:
-        InputError: no particle has a finite position, or dx is not > 0.
+        InputError: no particle has a finite position, dx is not > 0, the margin is not >= 0, or the particles are so
+            far apart that their grid has too many nodes to count.
     """
     x = np.asarray(x)
     finite = x[np.isfinite(x).all(-1)]
     if not len(finite):
         raise InputError("fit_grid found no particle with a finite position.")
-    if not dx > 0:
-        raise InputError(f"dx = {dx}: the grid spacing must be > 0 m.")
+    if not (dx > 0 and np.isfinite(dx)):
+        raise InputError(f"dx = {dx}: the grid spacing must be > 0 m, and finite.")
+    if not (margin >= 0 and np.isfinite(margin)):
+        raise InputError(f"margin = {margin}: the room around the particles must be >= 0 m, and finite.")
+    extent, reach = (float(a.max()) / dx for a in (np.ptp(finite, axis=0) + 2 * margin, abs(finite) + margin))
+    if extent > _LONGEST or reach > _FARTHEST:
+        raise InputError(
+            f"the particles span {extent:.2g} cells of dx = {dx} m and lie {reach:.2g} from the origin (at most"
+            f" {_LONGEST:.2g} and {_FARTHEST:.2g}): take a larger dx, or remove strays."
+        )
     low = np.floor((finite.min(0) - margin) / dx).astype(int) - WALL
     high = np.ceil((finite.max(0) + margin) / dx).astype(int) + WALL
     nx, ny, nz = (round_up_size(int(n)) for n in high - low + 1)
@@ -159,3 +181,7 @@ def round_up_size(nodes: int) -> int:
     """The next of the sizes 2ᵏ and 3·2ᵏ, 8 or more."""
     sizes = (size << k for k in range(30) for size in (8, 12))
     return next(size for size in sizes if size >= nodes)
+
+
+def _is_known(value):
+    return isinstance(value, jax.Array) and not isinstance(value, jax.core.Tracer)
