@@ -17,8 +17,8 @@ from pigjax.scene import load_scene, run_scene
 
 ROOT = Path(__file__).parents[1]
 SCENES = {path.stem: path for path in sorted((ROOT / "examples" / "materials").glob("*.toml"))}
-SHEET, TILE = (6, (160, 120)), (152, 114)  # pictures a clip and their size; size in the animation
-PLAYED = 32  # pictures of the animation
+SHEET, TILE = (6, (184, 138)), (208, 156)  # pictures a clip and their size; size in the animation
+PLAYED = 28  # pictures of the animation
 
 
 def main() -> None:
@@ -66,7 +66,7 @@ def write_sheet(clips: dict[str, np.ndarray], path: Path) -> None:
                 Image.fromarray(frame).resize((width, height), Image.Resampling.LANCZOS), (left + i * width, top)
             )
         label(sheet, name, (left + 4, top + 2))
-    sheet.quantize(64, dither=Image.Dither.NONE).save(path, optimize=True)
+    few_colours(sheet, 256).save(path, optimize=True)
 
 
 def write_animation(clips: dict[str, np.ndarray], path: Path) -> None:
@@ -84,9 +84,14 @@ def write_animation(clips: dict[str, np.ndarray], path: Path) -> None:
             label(page, name, (at[0] + 3, at[1] + 1))
         pictures.append(page)
     # one palette without dithering: what rests stays the same pixels and costs nothing
-    palette = pictures[len(pictures) // 2].quantize(48)
+    palette = few_colours(pictures[len(pictures) // 2], 128)
     pictures = [page.quantize(palette=palette, dither=Image.Dither.NONE) for page in pictures]
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=90, loop=0, optimize=True)
+
+
+def few_colours(picture: Image.Image, count: int) -> Image.Image:
+    """An octree keeps the few bright colours that a median cut spends on shades of the table."""
+    return picture.quantize(count, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
 
 
 def evenly(clip: np.ndarray, count: int) -> np.ndarray:
