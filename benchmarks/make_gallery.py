@@ -47,7 +47,7 @@ def run(name: str, folder: Path) -> str:
     told = (
         f"{name:11s} {took:5.1f} s, {worked:.1f} s of CPU ({stages}; run + compile)",
         f"{sizes['particles']} particles, {sizes['frames']} frames of {sizes['substeps_per_frame']} substeps",
-        f"J ≥ {report.health.get('min_J', float('nan')):.3f}",
+        *(f"J ≥ {report.health[key]:.3f}" for key in ("min_J",) if key in report.health),
         *(f"note: {warning}" for warning in report.warnings),
     )
     return "\n    ".join(told)
@@ -99,7 +99,7 @@ def evenly(clip: np.ndarray, count: int) -> np.ndarray:
 
 
 def label(page: Image.Image, name: str, at: tuple[int, int]) -> None:
-    ImageDraw.Draw(page).text(at, name.replace("_", " "), fill=(40, 40, 40))
+    ImageDraw.Draw(page).text(at, name.replace("_", " "), fill="black", stroke_width=2, stroke_fill="white")
 
 
 if __name__ == "__main__":
