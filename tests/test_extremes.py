@@ -533,5 +533,5 @@ SILENT_ONCE = {
 
 
 @pytest.mark.parametrize("case", SILENT_ONCE)
-def test_open(case):
+def test_what_was_silent_once_is_counted_or_refused(case):
     SILENT_ONCE[case]()
