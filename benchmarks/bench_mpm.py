@@ -97,6 +97,8 @@ def speed(arguments):
     print("| case | law | ours, 1 device | ours, all | Taichi best | Warp | ours / best rival | compile s | health |")
     print("|---|---|---|---|---|---|---|---|---|")
     for law, model in (("fixed_corotated", "fcr"), ("neo_hookean", "nh")):
+        if law not in arguments.laws:
+            continue
         for count, nodes in CASES:
             compile_seconds, one, _, health = ours(law, count, nodes, devices=1)
             _, every, _, _ = ours(law, count, nodes, devices=all_devices)
@@ -243,6 +245,7 @@ PARTS = {part.__name__: part for part in (speed, laws, gradient, domain, feature
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("parts", nargs="*", metavar="part", help=", ".join(PARTS))
+    parser.add_argument("--laws", nargs="+", default=["fixed_corotated", "neo_hookean"], help="of part speed")
     parser.add_argument("--rivals", help="Python with Taichi and Warp")
     parser.add_argument("--peers", default="../shared/peers", help="folder of the rivals' scripts")
     arguments = parser.parse_args()

@@ -16,11 +16,12 @@ import numpy as np
 from pigjax.errors import SimulationError
 from pigjax.frames import Box, run_frames
 from pigjax.materials import MaterialTable
-from pigjax.matter import Grid, Health, Particles, SimConfig, Trajectory, round_up_size
+from pigjax.matter import Grid, Health, Particles, SimConfig, Trajectory
 
 _SMALL = 50_000  # nodes that need no box: less than other costs of a step
 _LARGEST = 200_000_000  # nodes
 _ROOM = 1.3  # a box is made so much longer than it must be: another size is another compilation
+_UNIT = 4  # nodes, of which sides are multiples
 _PER_DEVICE = 4096  # particles that are worth a device of their own
 
 
@@ -107,8 +108,8 @@ class Fit:
         shape = np.array(self.shape)
         wasteful = _nodes(shape) > max(8 * _nodes(needed), 4 * len(ahead))
         if (needed > shape).any() or wasteful:
-            room = [round_up_size(int(n * _ROOM)) for n in needed]
-            shape = np.array(room) if wasteful else np.maximum(room, shape)
+            room = -(-(needed * _ROOM).astype(int) // _UNIT) * _UNIT
+            shape = room if wasteful else np.maximum(room, shape)
         shape = np.minimum(shape, sides)
         if (nodes := _nodes(shape)) > _LARGEST:
             raise SimulationError(

@@ -4,7 +4,7 @@ from pigjax.matter.chunks import State, tile_order, to_chunks, to_rows
 from pigjax.matter.config import SimConfig
 from pigjax.matter.groups import Group, Grouping, bound_visual, group_by_law
 from pigjax.matter.health import Health, StepHealth, perfect_health
-from pigjax.matter.state import WALL, Grid, Particles, Trajectory, fit_grid, make_particles, round_up_size, vast_grid
+from pigjax.matter.state import WALL, Grid, Particles, Trajectory, fit_grid, make_particles, vast_grid
 
 __all__ = [
     "WALL",
@@ -22,7 +22,6 @@ __all__ = [
     "group_by_law",
     "make_particles",
     "perfect_health",
-    "round_up_size",
     "tile_order",
     "to_chunks",
     "to_rows",

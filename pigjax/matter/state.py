@@ -163,7 +163,7 @@ def fit_grid(x: Float[Array, "p 3"] | np.ndarray, dx: float, *, margin: float = 
         )
     low = np.floor((finite.min(0) - margin) / dx).astype(int) - WALL
     high = np.ceil((finite.max(0) + margin) / dx).astype(int) + WALL
-    nx, ny, nz = (round_up_size(int(n)) for n in high - low + 1)
+    nx, ny, nz = (_round_up_size(int(n)) for n in high - low + 1)
     low -= (np.array([nx, ny, nz]) - (high - low + 1)) // 2
     return Grid(jnp.asarray(low * dx, float), jnp.asarray(dx, float), (nx, ny, nz))
 
@@ -177,7 +177,7 @@ def vast_grid(dx: float) -> Grid:
     return Grid(jnp.full(3, -(nodes // 2) * dx), jnp.asarray(dx, float), (nodes,) * 3)
 
 
-def round_up_size(nodes: int) -> int:
+def _round_up_size(nodes: int) -> int:
     """The next of the sizes 2ᵏ and 3·2ᵏ, 8 or more."""
     sizes = (size << k for k in range(30) for size in (8, 12))
     return next(size for size in sizes if size >= nodes)
