@@ -16,3 +16,10 @@ def x64():
     """Run one test in float64, and leave the global setting as it was."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compiled_code_is_dropped():
+    """After each module: what XLA:CPU compiles is mapped into memory piece by piece, and the pieces have a limit."""
+    yield
+    jax.clear_caches()

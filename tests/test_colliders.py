@@ -335,6 +335,7 @@ def test_a_soft_contact_tends_to_the_hard_one():
     np.testing.assert_allclose(soft, hard, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_rollout_is_differentiable_to_the_pose_of_a_soft_collider(x64):
     """Of where a block is after two frames, by everything about a turning box below it."""
     gravity = jnp.asarray([2.0, 0.0, -9.8])

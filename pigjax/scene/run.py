@@ -107,20 +107,21 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
     """Simulate what is not on disk yet, one rollout per frame on a grid that is fitted anew."""
     frames, particles = scene.simulation.frames, plan.particles
     done = io.last_state(folder, signature=key) if folder.exists() else None
-    checkpoint = folder / "last.ckpt"
-    if done is None:
-        done = 0
-        _save(folder, 0, particles, key, checkpoint)
-    elif done < frames:
-        saved, particles = io.load_pytree(checkpoint, (np.zeros((), np.int64), particles))
-        done = int(saved)
-    domain = vast_grid(scene.simulation.dx)
-    steps: dict[str, Any] = {"frames": max(frames - done, 1), "frame_dt": plan.frame_dt}
+    checkpoint, fit = folder / "last.ckpt", Fit()
+    # the same for a run that goes on as for one from the start
+    domain, near = vast_grid(scene.simulation.dx), fit_grid(particles.x, scene.simulation.dx)
+    steps: dict[str, Any] = {"frames": max(frames, 1), "frame_dt": plan.frame_dt}
     steps |= {"gravity": plan.gravity, "colliders": plan.colliders}
-    near = fit_grid(particles.x, scene.simulation.dx)
     config = choose_integrator(particles, near, plan.table, plan.config, **steps)
     substeps = choose_substeps(particles, near, plan.table, config, **steps)
-    fit = Fit()
+    if done is None:
+        done = 0
+        _save(folder, 0, particles, fit, key, checkpoint)
+    elif done < frames:
+        saved, particles, box = io.load_pytree(checkpoint, (np.zeros((), np.int64), particles, np.zeros(4)))
+        done = int(saved)
+        nx, ny, nz, fit.slack = map(float, box)
+        fit.shape = int(nx), int(ny), int(nz)
     worst: list[Health] = []
     dtype = particles.x.dtype
     for frame in range(done + 1, frames + 1):
@@ -145,7 +146,7 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
                 f"frame {frame} of {frames}: {', '.join(health.problems())}; states up to frame {frame - 1} are kept in"
                 f" {folder}. Lower simulation.cfl, or make matter softer or slower."
             )
-        _save(folder, frame, particles, key, checkpoint)
+        _save(folder, frame, particles, fit, key, checkpoint)
     tell("simulate", frames, frames)
     report.modelled["integrator"] = config.integrator
     report.sizes |= {"substeps_per_frame": substeps, "last_grid": fit.shape, "resumed_from_frame": done}
@@ -163,10 +164,10 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
             )
 
 
-def _save(folder: Path, frame: int, particles: Particles, key: str, checkpoint: Path) -> None:
+def _save(folder: Path, frame: int, particles: Particles, fit: Fit, key: str, checkpoint: Path) -> None:
     arrays = {"x": particles.x, "v": particles.v, "F_visual": particles.F_visual}
     io.save_state(folder, frame, {name: np.asarray(a) for name, a in arrays.items()}, signature=key)
-    io.save_pytree(checkpoint, (np.asarray(frame), particles))
+    io.save_pytree(checkpoint, (np.asarray(frame), particles, np.array([*fit.shape, fit.slack], float)))
 
 
 def _draw(
