@@ -13,31 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from segmentation.tabletop import load_tabletop, mean_scores, scores_by_object
 
-from pigjax.io import load_ply, load_views
-from pigjax.metrics import boundary_iou, mean_iou
-from pigjax.segmentation import enough_capacity, fill_unseen, lift_masks, object_mask
-from pigjax.splat import Gaussians, RenderConfig, surface_depth
-
-ROOT = Path(__file__).parent.parent
-
-
-def load_scene(folder):
-    if folder is not None:
-        return load_ply(folder / "points.ply"), np.load(folder / "points.ids.npy"), folder
-    data = np.load(ROOT / "tests/data/tabletop_cloud.npz")
-    count = len(data["means"])
-    low, high = data["low"], data["high"]
-    smallest, largest = data["log_scale_range"]
-    log_scales = smallest + data["log_scales"] / 255 * (largest - smallest)
-    gaussians = Gaussians(
-        np.asarray(low + data["means"] / 65535 * (high - low), np.float32),
-        np.repeat(np.asarray(log_scales, np.float32)[:, None], 3, 1),
-        np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        np.full(count, data["logit_opacity"]),
-        np.asarray((data["colours"][:, None] / 255 - 0.5) / 0.28209479177387814, np.float32),
-    )
-    return gaussians, data["object_id"], ROOT / "examples/tabletop"
+from pigjax.segmentation import enough_capacity, fill_unseen, lift_masks
+from pigjax.splat import RenderConfig, surface_depth
 
 
 def timed(call, repeats):
@@ -60,10 +39,9 @@ def main():
     parser.add_argument("--quick", action="store_true", help="every fourth view, no sweep")
     options = parser.parse_args()
 
-    gaussians, truth, folder = load_scene(options.folder)
-    train, test = (load_views(folder, masks=True, split=split) for split in ("train", "test"))
-    train = train[:: 4 if options.quick else 1]
-    num_ids = int(max(truth.max(), train.masks.max())) + 1
+    scene = load_tabletop(options.folder)
+    gaussians, truth, test, num_ids = scene.gaussians, scene.truth, scene.test, scene.num_ids
+    train = scene.train[:: 4 if options.quick else 1]
     config = enough_capacity(gaussians, train.cameras, RenderConfig())
     print(
         f"{len(gaussians)} Gaussians, {len(train)} views of {train.cameras.width}x{train.cameras.height}, {num_ids} ids"
@@ -97,16 +75,9 @@ def main():
     filled = fill_unseen(gaussians, labels)
     print(f"unseen filled: right {np.mean(np.asarray(filled.object_id) == truth):.4f}")
     for mode in ("isolated", "visible"):
-        scores = []
-        for object_id in range(1, num_ids):
-            drawn = [object_mask(gaussians, filled, jnp.asarray(object_id), camera, mode=mode, config=config)
-                     for camera in map(test.cameras.__getitem__, range(len(test)))]  # fmt: skip
-            expected = jnp.asarray(test.masks == object_id)
-            scores.append(
-                (float(mean_iou(jnp.stack(drawn), expected)), float(boundary_iou(jnp.stack(drawn), expected)))
-            )
-        each = "  ".join(f"{100 * iou:.1f}/{100 * boundary:.1f}" for iou, boundary in scores)
-        print(f"test views, {mode}: mIoU/mBIoU by id {each}  mean {100 * np.mean(scores, 0)}")
+        scores = scores_by_object(gaussians, filled.object_id, test, range(1, num_ids), mode=mode)
+        each = "  ".join(f"{scene.names[number]} {iou:.1f}/{edge:.1f}" for number, (iou, edge) in scores.items())
+        print(f"test views, {mode}: mIoU/mBIoU {each}  mean without the table %.1f/%.1f" % mean_scores(scores))
     if not options.quick:
         sweep_thresholds(lift, truth)
 
