@@ -24,6 +24,7 @@ _LEAST_SKY = 2.0  # a sample that sees less of the outside, or sees it on both s
 _LEAST_DISCS = 8
 _LEAST_JUMP = 0.3  # of the winding number across the surface; below it the shell is no shell
 _FULL = 0.25  # share of inner voxels with Gaussians in them above which a cloud is filled, not a shell
+_MOST_SWELLING = 2.0  # a filled cloud's density spans little more than its winding number; strays in a shell, far more
 _MOST_SAMPLES = 4_000_000
 _DIRECTIONS = np.array([d for d in product((-1, 0, 1), repeat=3) if any(d)])
 
@@ -125,19 +126,22 @@ def solid_of(shell: Shell, *, max_cells: int = 64) -> Solid:
     shape = np.array(occupied.shape)
     grid = _Poisson(shape, origin, voxel)
     winding = grid.winding(discs.points, discs.normals, discs.areas)
-    deep = ndimage.binary_erosion(winding > 0.5 * _jump(winding, discs, grid), iterations=3)
-    if deep.any() and occupied[deep].mean() > _FULL:
-        return _bounded(_density_level(occupied, deep), origin, voxel, low - voxel, high + voxel)
+    within = winding > 0.5 * _jump(winding, discs, grid)
+    deep = ndimage.binary_erosion(within, iterations=3)
+    fullness = occupied[deep].mean() if deep.any() else 0.0
+    voxels = occupied.sum() / max(fullness, _FULL)
+    if fullness > _FULL and voxels < _MOST_SWELLING * within.sum():
+        return _bounded(_density_level(occupied, int(voxels)), origin, voxel, low - voxel, high + voxel)
     shift = _level_shift(winding, discs, grid)
     winding = grid.winding(discs.points + shift[:, None] * discs.normals, discs.normals, discs.areas)
     return _bounded(winding / _jump(winding, discs, grid), origin, voxel, low, high)
 
 
-def _density_level(occupied: Bool[np.ndarray, "x y z"], deep: Bool[np.ndarray, "x y z"]) -> Float[np.ndarray, "x y z"]:
-    """For a cloud that is filled with Gaussians: their density, scaled so that what exceeds one half has its volume."""
+def _density_level(occupied: Bool[np.ndarray, "x y z"], voxels: int) -> Float[np.ndarray, "x y z"]:
+    """For a cloud that is filled with Gaussians: their density, scaled so that it exceeds one half in `voxels`."""
     density = ndimage.gaussian_filter(occupied.astype(np.float32), 1.5)
-    voxels = min(int(occupied.sum() / occupied[deep].mean()), density.size - 1)
-    return density / (2 * np.partition(density.ravel(), -voxels - 1)[-voxels - 1])
+    place = density.size - 1 - min(voxels, density.size - 1)
+    return density / (2 * np.partition(density.ravel(), place)[place])
 
 
 def _bounded(winding, origin, voxel, low, high) -> Solid:
