@@ -1,11 +1,18 @@
 """What the benchmarks share: warm medians with compile time apart, and the machine's name."""
 
+import os
 import platform
 import statistics
 import time
 from pathlib import Path
 
 import jax
+
+
+def use_host_devices(count: int | None = None) -> None:
+    """On a CPU, as many devices (by default one per core); call it before JAX computes anything."""
+    if jax.config.jax_platforms in (None, "", "cpu"):
+        jax.config.update("jax_num_cpu_devices", count or len(os.sched_getaffinity(0)))
 
 
 def measure(function, *inputs, repeats=9, seconds=20.0):

@@ -14,22 +14,19 @@ import subprocess
 import time
 from pathlib import Path
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
+from _timing import machine, use_host_devices
 
-jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
-
-import equinox as eqx  # noqa: E402  (the devices must be there first)
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-from _timing import machine  # noqa: E402
-
-from pigjax.boxes import whole  # noqa: E402
-from pigjax.colliders import Plane  # noqa: E402
-from pigjax.contact import BodyContact  # noqa: E402
-from pigjax.frames import run_frames  # noqa: E402
-from pigjax.materials import LAWS, Material, material_table  # noqa: E402
-from pigjax.matter import Grid, fit_grid, make_particles  # noqa: E402
-from pigjax.mls_mpm import SimConfig, rollout  # noqa: E402
+from pigjax.boxes import whole
+from pigjax.colliders import Plane
+from pigjax.contact import BodyContact
+from pigjax.frames import run_frames
+from pigjax.materials import LAWS, Material, material_table
+from pigjax.matter import Grid, fit_grid, make_particles
+from pigjax.mls_mpm import SimConfig, rollout
 
 DT = 1e-4  # the rivals' step
 ELASTIC = {"young": 1e5, "poisson": 0.2}
@@ -249,6 +246,7 @@ def main():
     parser.add_argument("--rivals", help="Python with Taichi and Warp")
     parser.add_argument("--peers", default="../shared/peers", help="folder of the rivals' scripts")
     arguments = parser.parse_args()
+    use_host_devices()
     print(machine(), f"load {os.getloadavg()[0]:.1f}")
     for name in arguments.parts or PARTS:
         print(f"\n{PARTS[name].__doc__}\n")

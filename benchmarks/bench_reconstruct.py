@@ -5,7 +5,10 @@ import os
 import resource
 from pathlib import Path
 
-import jax
+import matplotlib.pyplot as plt
+from _timing import machine, use_host_devices
+
+from pigjax import FitConfig, RenderConfig, load_points, load_views, reconstruct, save_ply
 
 TABLETOP = Path(__file__).parents[1] / "examples" / "tabletop"
 
@@ -19,13 +22,7 @@ parser.add_argument("--devices", type=int, default=len(os.sched_getaffinity(0)),
 parser.add_argument("--plot", type=Path, help="picture of PSNR and SSIM over time")
 parser.add_argument("--out", type=Path, help="write the Gaussians here (.ply)")
 arguments = parser.parse_args()
-if jax.config.jax_platforms in (None, "", "cpu"):
-    jax.config.update("jax_num_cpu_devices", arguments.devices)
-
-from _timing import machine  # noqa: E402
-
-from pigjax import FitConfig, RenderConfig, load_points, load_views, reconstruct, save_ply  # noqa: E402
-
+use_host_devices(arguments.devices)
 print(machine())
 views = load_views(TABLETOP)
 config = FitConfig(
@@ -55,11 +52,6 @@ print(
 if arguments.out:
     save_ply(arguments.out, result.gaussians)
 if arguments.plot:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     scored = [progress for progress in result.history if progress.psnr is not None]
     figure, axis = plt.subplots(figsize=(5, 3), layout="constrained")
     axis.plot([p.seconds for p in scored], [p.psnr for p in scored], "o-", label="PSNR")

@@ -9,11 +9,23 @@ JSON line) run in their own process before each row, so both meet the same machi
 import argparse
 import json
 import os
+import resource
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from _timing import machine, measure, use_host_devices
+from jax import lax
+
+from pigjax import Gaussians, RenderConfig, look_at, render, stack_cameras
+from pigjax.bands import replicate
+from pigjax.lists import front_to_back, list_pass
+from pigjax.splat import as_splats, blend_config, colours, project_splats
+from pigjax.tiles import blend
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--rows", nargs="*", default=["1000:256", "10000:256", "10000:512", "100000:256", "100000:512"],
@@ -26,22 +38,7 @@ parser.add_argument("--growth", action="store_true", help="time against splats, 
 parser.add_argument("--plot", type=Path, help="picture of --growth")
 parser.add_argument("--forward-only", action="store_true")
 options = parser.parse_args()
-if jax.config.jax_platforms in (None, "", "cpu"):
-    jax.config.update("jax_num_cpu_devices", options.devices)
-
-import resource  # noqa: E402
-from dataclasses import replace  # noqa: E402
-
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-from _timing import machine, measure  # noqa: E402
-from jax import lax  # noqa: E402
-
-from pigjax import Gaussians, RenderConfig, look_at, render, stack_cameras  # noqa: E402
-from pigjax.bands import replicate  # noqa: E402
-from pigjax.lists import front_to_back, list_pass  # noqa: E402
-from pigjax.splat import as_splats, blend_config, colours, project_splats  # noqa: E402
-from pigjax.tiles import blend  # noqa: E402
+use_host_devices(options.devices)
 
 EXACT = RenderConfig(alpha_min=1e-6, transmittance_min=0.0)
 

@@ -43,14 +43,3 @@ def everywhere(condition: Any) -> Any:
 @everywhere.def_vmap
 def _everywhere_of_batch(axis_size, in_batched, condition):
     return condition.all(0) if in_batched[0] else condition, False
-
-
-@jax.custom_batching.custom_vmap
-def largest(number: Any) -> Any:
-    """The integer itself; inside vmap, the largest of the batch, without a batch axis. It has no derivative."""
-    return number
-
-
-@largest.def_vmap
-def _largest_of_batch(axis_size, in_batched, number):
-    return number.max(0) if in_batched[0] else number, False

@@ -226,3 +226,7 @@ def info(path: Annotated[Path, typer.Argument(help="A .ply, .splat or .spz, a sc
     for name, value in describe_file(path).items():
         table.add_row(name, value)
     _console.print(table)
+
+
+if __name__ == "__main__":
+    main()

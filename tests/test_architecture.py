@@ -25,6 +25,7 @@ FLOORS = [
     {"segmentation", "particles", "solids", "reconstruct", "pruning"},
     {"scene"},
     {"cli"},
+    {"__main__"},
 ]
 FLOOR_OF = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
 # the two worlds meet in particles.py and solids.py only

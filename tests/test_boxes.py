@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pigjax import boxes
 from pigjax.boxes import Fit
 from pigjax.colliders import Plane
 from pigjax.errors import InputError
@@ -47,7 +48,7 @@ def test_a_vast_domain_gives_what_a_small_one_gives(x64):
     assert float(jnp.abs(path_a.x[-1] - particles.x).max()) > 0.9 * DX  # they did move
 
 
-def test_a_box_that_matter_outruns_is_made_larger(x64):
+def test_a_box_that_matter_outruns_is_made_larger(x64, monkeypatch):
     """Matter that free flight would not have carried so far: thrown back by a moving wall."""
     particles = two_cubes()
     bat = Plane(point=jnp.asarray([1.2, 0, 0]), normal=jnp.asarray([1.0, 0, 0]), velocity=jnp.asarray([8.0, 0, 0]))
@@ -61,14 +62,8 @@ def test_a_box_that_matter_outruns_is_made_larger(x64):
         "frames": 1,
         "substeps": 40,
     }
-    from pigjax import boxes
-
-    boxes_room = boxes._ROOM
-    boxes._ROOM = 1.0
-    try:
-        moved, _, health = fit.frame(particles, vast_grid(DX), TABLE, config, 1, **step)
-    finally:
-        boxes._ROOM = boxes_room
+    monkeypatch.setattr(boxes, "_ROOM", 1.0)
+    moved, _, health = fit.frame(particles, vast_grid(DX), TABLE, config, 1, **step)
     assert int(health.escaped) == 0
     whole, _, _ = rollout(
         particles, fit_grid(particles.x, DX, margin=0.7), TABLE, config, frames=1, frame_dt=0.02, gravity=(0, 0, 0),

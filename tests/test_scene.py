@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,8 @@ from typer.testing import CliRunner
 from pigjax import io
 from pigjax.cli import app
 from pigjax.errors import InputError, MissingFileError, SceneError, SimulationError
-from pigjax.scene import load_scene, objects, run_scene, scene_from
+from pigjax.scene import load_scene, objects, plan, run_scene, scene_from
+from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "tabletop" / "scene.toml"
@@ -185,6 +187,21 @@ def test_a_whole_scene_leaves_video_pictures_states_and_report(finished):
     # the first frame shows the ball
     picture = io.read_image(out / "contact_sheet.png")
     assert picture.max() > 0.3
+
+
+def test_objects_that_a_scene_does_not_name_are_warned_of(monkeypatch):
+    scene = load_scene(EXAMPLE)
+    few = msgspec.structs.replace(scene, objects={name: scene.objects[name] for name in ("table", "duck")})
+    seen = jnp.asarray([0, 1, 2, 7, 4, 4, -1])
+    monkeypatch.setattr(plan, "lift_masks", lambda *args, **kwargs: Labels(seen, None, None))
+    monkeypatch.setattr(plan, "fill_unseen", lambda gaussians, labels: labels)
+    inputs = plan.read_inputs(few)
+    with pytest.warns(UserWarning, match="says nothing of jenga, mug: drawn, but nothing collides"):
+        plan.segment(few, inputs)
+    seen = jnp.asarray([0, 1, 2, 3, 4, 5, 6, 7, -1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        plan.segment(scene, plan.read_inputs(scene))
 
 
 def test_the_ball_falls_freely_before_it_touches_the_floor(finished):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pigjax import io
 from pigjax.camera import Camera, orbit, stack_cameras
@@ -22,7 +23,7 @@ from pigjax.materials import Material, MaterialTable
 from pigjax.matter import Particles
 from pigjax.mls_mpm import SimConfig
 from pigjax.particles import Binding, bind, seed_particles
-from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec, _suggest
+from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec, suggest
 from pigjax.segmentation import Labels, fill_unseen, lift_masks
 from pigjax.solids import collider_from_gaussians
 from pigjax.splat import Gaussians
@@ -35,6 +36,7 @@ class Inputs:
     gaussians: Gaussians
     views: io.Views | None
     ids: dict[str, int]  # id of each object of the scene
+    names: dict[int, str]  # names that `input.names` gives to ids
 
 
 @dataclass
@@ -69,7 +71,8 @@ def read_inputs(scene: Scene) -> Inputs:
     known: dict[str, int] = {}
     if spec.names is not None:
         known = {str(name): int(number) for number, name in io.read_json(scene.path(spec.names)).items()}
-    return Inputs(gaussians, views, {name: _id_of(name, scene, known) for name in scene.objects})
+    ids = {name: _id_of(name, scene, known) for name in scene.objects}
+    return Inputs(gaussians, views, ids, {number: name for name, number in known.items()})
 
 
 def _id_of(name: str, scene: Scene, known: dict[str, int]) -> int:
@@ -77,7 +80,7 @@ def _id_of(name: str, scene: Scene, known: dict[str, int]) -> int:
     if own is not None:
         return own
     if name not in known:
-        remedy = _suggest(name, known) if known else f"give objects.{name}.id, or input.names"
+        remedy = suggest(name, known) if known else f"give objects.{name}.id, or input.names"
         raise SceneError(f"objects.{name}: no object of that name in {scene.input.names or 'input.names'}; {remedy}.")
     return known[name]
 
@@ -113,7 +116,19 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
     for name, number in inputs.ids.items():
         if found[number] == 0:
             raise SceneError(f"objects.{name}: no Gaussian has its id {number} in the masks; check input.masks.")
+    _warn_of_unnamed(inputs, np.flatnonzero(found[1:]) + 1)
     return labels
+
+
+def _warn_of_unnamed(inputs: Inputs, found: Int[np.ndarray, "k"]) -> None:
+    left = [int(number) for number in found if number not in inputs.ids.values()]
+    if left:
+        listed = ", ".join(inputs.names.get(number, f"id {number}") for number in left)
+        warnings.warn(
+            f"the scene says nothing of {listed}: drawn, but nothing collides with them; add objects.<name>,"
+            " with fixed = true for what stays.",
+            stacklevel=3,
+        )
 
 
 def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
@@ -239,7 +254,7 @@ def make_cameras(scene: Scene, inputs: Inputs, focus: Float[np.ndarray, "3"]) ->
 def _camera_of_view(spec: CameraSpec, inputs: Inputs) -> Camera:
     if inputs.views is None or spec.view not in inputs.views.names:
         names = () if inputs.views is None else inputs.views.names
-        raise SceneError(f"camera.view = {spec.view!r}: {_suggest(str(spec.view), names)}.")
+        raise SceneError(f"camera.view = {spec.view!r}: {suggest(str(spec.view), names)}.")
     return inputs.views.cameras[inputs.views.names.index(spec.view)].resized(spec.width, spec.height)
 
 

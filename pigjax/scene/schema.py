@@ -120,7 +120,7 @@ class ObjectSpec(Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
         if (self.material is None) == (self.model is None):
             raise SceneError(f"objects.{name}: give either material (a preset) or model (a law with its numbers).")
         if self.material is not None and self.material not in PRESETS:
-            raise SceneError(f"objects.{name}.material = {self.material!r}: {_suggest(self.material, PRESETS)}.")
+            raise SceneError(f"objects.{name}.material = {self.material!r}: {suggest(self.material, PRESETS)}.")
         settings: dict[str, Any] = dict(PRESETS[self.material]) if self.material else {"model": self.model}
         settings |= {key: value for key in _NUMBERS if (value := getattr(self, key)) is not None}
         if "density" not in settings:
@@ -308,7 +308,7 @@ def _explain(message: str, values: dict[str, Any]) -> str:
     if at.split(".")[0] in ("objects", *_COLLIDERS):
         table = values.get(at.split(".")[0], {})
         at = next((f"{at}.{key}" for key, entry in table.items() if isinstance(entry, dict) and name in entry), at)
-    return f"{at + '.' if at else ''}{name}: unknown field; {_suggest(name, known)}."
+    return f"{at + '.' if at else ''}{name}: unknown field; {suggest(name, known)}."
 
 
 def _fields_at(place: str) -> tuple[str, ...]:
@@ -319,6 +319,7 @@ def _fields_at(place: str) -> tuple[str, ...]:
     return tuple(name for name in fields if name != "folder")
 
 
-def _suggest(name: str, known) -> str:
+def suggest(name: str, known) -> str:
+    """The nearest right name, or all of them."""
     near = difflib.get_close_matches(name, list(known), 1)
     return f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(known)}"
