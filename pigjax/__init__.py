@@ -9,6 +9,7 @@ from pigjax.camera import Camera, interpolate_path, look_at, orbit, stack_camera
 from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
 from pigjax.contact import BodyContact
+from pigjax.editing import extract_object, hole_mask, remove_object
 from pigjax.errors import InputError, MissingFileError, SceneError, SimulationError
 from pigjax.io import Views, load_gaussians, load_masks, load_ply, load_points, load_views, save_ply, write_video
 from pigjax.materials import Material, MaterialTable, material_table, preset
@@ -65,8 +66,10 @@ __all__ = [
     "contributions",
     "deform",
     "eigen_clamp",
+    "extract_object",
     "fill_unseen",
     "fit_grid",
+    "hole_mask",
     "interpolate_path",
     "lift_masks",
     "load_gaussians",
@@ -85,6 +88,7 @@ __all__ = [
     "prune",
     "psnr",
     "reconstruct",
+    "remove_object",
     "render",
     "required_capacity",
     "rollout",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 
 import equinox as eqx
@@ -36,6 +37,10 @@ class Camera(eqx.Module):
     def __getitem__(self, index) -> Camera:
         """One camera, or a slice, of a batch."""
         return Camera(self.world_to_cam[index], self.focal[index], self.centre[index], self.width, self.height)
+
+    def __iter__(self) -> Iterator[Camera]:
+        """The cameras of a batch. (Without it Python would index past the end, where JAX clamps, for ever.)"""
+        return (self[view] for view in range(len(self)))
 
     def __len__(self) -> int:
         """Number of cameras of a batch.

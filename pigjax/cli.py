@@ -201,15 +201,22 @@ def segment(
     tau_t: Annotated[float, typer.Option(help="Transmittance that marks the surface.", min=0, max=1)] = 0.5,
     tau_d: Annotated[float, typer.Option(help="Relative depth tolerance of a vote.", min=0, max=1)] = 0.03,
     fill: Annotated[bool, typer.Option(help="Give unseen Gaussians the id of their neighbours.")] = True,
+    weighting: Annotated[str, typer.Option(help="centre: the paper's vote; alpha: credit by alpha·T.")] = "centre",
+    purity: Annotated[float, typer.Option(help="Least share of the votes to be of an object.", min=0, max=1)] = 0.0,
+    remove: Annotated[list[str] | None, typer.Option(help="Object to leave out, by name or id; repeat it.")] = None,
 ) -> None:
-    """Lift masks to the Gaussians; writes labels, one .ply per object, and a sheet that shows which id is which."""
+    """Lift masks to the Gaussians; writes labels, one .ply per object, and a sheet that shows which id is which.
+
+    With --remove also the scene without an object, and the hole that it leaves in every view.
+    """
     from pigjax import io
     from pigjax.scene.objects import segment_files
 
     cloud = io.load_gaussians(gaussians)
     loaded = io.load_views(views, masks=masks if masks is not None else True)
     known = {} if names is None else {int(k): str(v) for k, v in io.read_json(names).items()}
-    counts = segment_files(cloud, loaded, known, out, tau_T=tau_t, tau_d=tau_d, fill=fill)
+    settings = {"tau_T": tau_t, "tau_d": tau_d, "weighting": weighting, "purity": purity}
+    counts = segment_files(cloud, loaded, known, out, fill=fill, remove=remove or (), **settings)
     table = Table("id", "object", "Gaussians")
     for number, count in counts.items():
         table.add_row(str(number), known.get(number, "never seen" if number < 0 else ""), str(count))

@@ -23,6 +23,7 @@ FLOORS = [
     {"boxes"},
     {"mls_mpm"},
     {"segmentation", "particles", "solids", "reconstruct", "pruning"},
+    {"editing"},
     {"scene"},
     {"cli"},
     {"__main__"},
@@ -30,7 +31,7 @@ FLOORS = [
 FLOOR_OF = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
 # the two worlds meet in particles.py and solids.py only
 SPLATS = {"splat", "lists", "footprints", "chunks", "bands", "tiles", "tile_walks", "clamp", "segmentation"}
-SPLATS |= {"starts", "relocation", "reconstruct", "filling", "shells", "pruning"}
+SPLATS |= {"starts", "relocation", "reconstruct", "filling", "shells", "pruning", "editing"}
 MATTER = {
     "matter",
     "mls_mpm",

@@ -26,6 +26,15 @@ def test_unproject_inverts_project(x64):
     np.testing.assert_allclose(z, depth, rtol=1e-12)
 
 
+def test_a_batch_of_cameras_is_walked_through_once_and_a_single_one_is_refused():
+    batch = orbit((0.0, 0.0, 0.0), radius=2.0, elevation=0.3, frames=3, focal=30.0, width=6, height=5)
+    walked = list(batch)
+    assert len(walked) == 3
+    np.testing.assert_array_equal([c.world_to_cam for c in walked], batch.world_to_cam)
+    with pytest.raises(TypeError, match="single camera"):
+        list(walked[0])
+
+
 def test_position_has_the_right_gradient_off_the_rigid_manifold(x64):
     world_to_cam = np.eye(4)
     world_to_cam[:3] += 0.1 * np.random.default_rng(0).normal(size=(3, 4))

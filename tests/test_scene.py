@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import msgspec
 import numpy as np
 import pytest
-from test_segmentation import load_cloud
 from typer.testing import CliRunner
 
 from pigjax import io
@@ -315,14 +314,3 @@ def test_bad_input_is_exit_code_2_and_one_line(tmp_path):
     assert "no.ply" in run.stderr
     assert len(run.stderr.strip().splitlines()) == 1
     assert "Traceback" not in run.stderr
-
-
-def test_segment_writes_labels_objects_and_a_sheet(tmp_path):
-    views = io.load_views(EXAMPLE.parent, masks=True, max_size=64)[[0, 5, 10, 15]]
-    cloud, _ = load_cloud()
-    counts = objects.segment_files(cloud, views, {2: "duck"}, tmp_path, tau_T=0.5, tau_d=0.05, fill=True)
-    assert sum(counts.values()) == len(cloud)
-    assert (tmp_path / "objects" / "002_duck.ply").exists()
-    assert len(io.load_ply(tmp_path / "objects" / "002_duck.ply")) == counts[2]
-    assert io.read_image(tmp_path / "objects.png").shape[1] >= 128
-    np.testing.assert_array_equal(np.bincount(np.load(tmp_path / "labels.npz")["object_id"])[2], counts[2])

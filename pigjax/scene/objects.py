@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,28 +12,53 @@ import jax.numpy as jnp
 import numpy as np
 
 from pigjax import io
-from pigjax.errors import MissingFileError
+from pigjax.editing import extract_object, hole_mask, remove_object
+from pigjax.errors import InputError, MissingFileError
 from pigjax.overlay import id_colours, id_image, legend_sheet, overlay
-from pigjax.scene.schema import load_scene
-from pigjax.segmentation import fill_unseen, lift_masks
+from pigjax.pruning import contributions
+from pigjax.scene.schema import load_scene, suggest
+from pigjax.segmentation import Labels, fill_unseen, lift_masks
 from pigjax.splat import Gaussians, render, sh_degree_of
 
 _SHEET_VIEWS = 4
+_LEAST_SEEN = 1.0  # pixels over all views; a Gaussian with less of them is a guess of the reconstruction
+_MAGENTA = np.array([1.0, 0.0, 1.0])
 _SH_CONSTANT = 0.28209479177387814
 
 
 def segment_files(
-    gaussians: Gaussians, views: io.Views, names: dict[int, str], out: Path, *, tau_T: float, tau_d: float, fill: bool
+    gaussians: Gaussians,
+    views: io.Views,
+    names: dict[int, str],
+    out: Path,
+    *,
+    fill: bool,
+    remove: Sequence[str] = (),
+    **settings: Any,
 ) -> dict[int, int]:
     """Lift masks and write `labels.npz`, `objects/<id>.ply`, `coloured.ply` and `objects.png`; Gaussians per id. Host.
 
+    For each object to remove also `removed/<id>.ply`, the scene without it, `removed/<id>/<view>.png`, its hole in
+    every view (white: what an inpainter must fill in), and `removed/<id>.png`, a few views before and after with the
+    hole in magenta.
+
+    Args:
+        gaussians: the scene.
+        views: with masks.
+        names: of the ids.
+        out: folder, made if it is missing.
+        fill: give unseen Gaussians the id of their neighbours.
+        remove: names or ids of objects.
+        settings: of `lift_masks`.
+
     Raises:
-        InputError: masks that do not fit the views, or files that cannot be written.
+        InputError: masks that do not fit the views, files that cannot be written, or an unknown object.
     """
+    doomed = [_id_of(name, names) for name in remove]
     train = views.subset("train") if "train" in views.splits else views
     assert train.masks is not None
     num_ids = int(np.max(train.masks)) + 1
-    labels = lift_masks(gaussians, train.cameras, train.masks, num_ids=num_ids, tau_T=tau_T, tau_d=tau_d)
+    labels = lift_masks(gaussians, train.cameras, train.masks, num_ids=num_ids, **settings)
     if fill:
         labels = fill_unseen(gaussians, labels)
     object_id = np.asarray(labels.object_id)
@@ -39,14 +66,41 @@ def segment_files(
     np.savez_compressed(out / "labels.npz", object_id=object_id, votes=labels.votes, confidence=labels.confidence)
     counts = {int(number): int(np.sum(object_id == number)) for number in np.unique(object_id)}
     for number in counts:
-        own = np.flatnonzero(object_id == number)
-        stem = "unseen" if number < 0 else f"{number:03d}" + (f"_{names[number]}" if number in names else "")
-        io.save_ply(out / "objects" / f"{stem}.ply", jax.tree.map(lambda values, own=own: values[own], gaussians))
+        io.save_ply(out / "objects" / f"{_stem(number, names)}.ply", extract_object(gaussians, labels, number))
     colours = id_colours(num_ids)[np.maximum(object_id, 0)] / 255
     flat = jnp.asarray((colours - 0.5) / _SH_CONSTANT, jnp.float32)[:, None]
     io.save_ply(out / "coloured.ply", eqx.tree_at(lambda g: g.sh, gaussians, flat))
     io.write_image(out / "objects.png", _sheet(gaussians, views, object_id, num_ids, names))
+    for number in doomed:
+        _remove(gaussians, labels, number, views, out / "removed", _stem(number, names))
     return counts
+
+
+def _stem(number: int, names: dict[int, str]) -> str:
+    return "unseen" if number < 0 else f"{number:03d}" + (f"_{names[number]}" if number in names else "")
+
+
+def _id_of(name: str, names: dict[int, str]) -> int:
+    known = {called: number for number, called in names.items()}
+    if name in known or name.isdecimal():
+        return known[name] if name in known else int(name)
+    raise InputError(f"--remove {name}: {suggest(name, known) if known else 'give its id, or names'}.")
+
+
+def _remove(gaussians: Gaussians, labels: Labels, number: int, views: io.Views, folder: Path, stem: str) -> None:
+    """The scene without one object, and the hole that it leaves in every view."""
+    rest = remove_object(gaussians, labels, number)
+    folder.mkdir(parents=True, exist_ok=True)
+    io.save_ply(folder / f"{stem}.ply", rest)
+    seen = contributions(gaussians, views.cameras) > _LEAST_SEEN
+    holes = [np.asarray(hole_mask(gaussians, labels, number, camera, seen=seen)) for camera in views.cameras]
+    io.save_masks(folder / stem, views.names, 255 * np.stack(holes).astype(np.int32))
+    pictures = []
+    for view in np.argsort([-hole.sum() for hole in holes], kind="stable")[:_SHEET_VIEWS]:
+        after = np.clip(np.asarray(render(rest, views.cameras[int(view)]).rgb), 0, 1)
+        after[holes[view]] = 0.5 * after[holes[view]] + 0.5 * _MAGENTA
+        pictures += [views.images[view], after]
+    io.write_image(folder / f"{stem}.png", io.contact_sheet(pictures, columns=2))
 
 
 def _sheet(
