@@ -91,6 +91,6 @@ def test_segment_writes_every_object_and_the_scene_without_one_with_its_hole(tmp
     hole = io.read_image(tmp_path / "out/removed/002_lid/a.png")
     hole = hole[..., 0] if hole.ndim == 3 else hole
     assert (hole[inside < 0.2] == 1).all()
-    assert (hole[inside > 0.45] == 0).all()
+    assert (hole[inside > 0.52] == 0).all()
     with pytest.raises(InputError, match="--remove lod: did you mean 'lid'"):
         CliRunner().invoke(app, [*command[:-1], "lod"], catch_exceptions=False)
