@@ -23,13 +23,14 @@ FLOORS = [
     {"boxes"},
     {"mls_mpm"},
     {"segmentation", "particles", "solids", "reconstruct", "pruning"},
+    {"evaluation"},
     {"scene"},
     {"cli"},
 ]
 FLOOR_OF = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
 # the two worlds meet in particles.py and solids.py only
 SPLATS = {"splat", "lists", "footprints", "chunks", "bands", "tiles", "tile_walks", "clamp", "segmentation"}
-SPLATS |= {"starts", "relocation", "reconstruct", "filling", "shells", "pruning"}
+SPLATS |= {"starts", "relocation", "reconstruct", "filling", "shells", "pruning", "evaluation"}
 MATTER = {
     "matter",
     "mls_mpm",
