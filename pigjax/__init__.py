@@ -10,7 +10,18 @@ from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
 from pigjax.contact import BodyContact
 from pigjax.errors import InputError, MissingFileError, SceneError, SimulationError
-from pigjax.io import Views, load_gaussians, load_masks, load_ply, load_points, load_views, save_ply, write_video
+from pigjax.evaluation import evaluate_labels
+from pigjax.io import (
+    Views,
+    load_dataset,
+    load_gaussians,
+    load_masks,
+    load_ply,
+    load_points,
+    load_views,
+    save_ply,
+    write_video,
+)
 from pigjax.materials import Material, MaterialTable, material_table, preset
 from pigjax.matter import Grid, Health, Particles, Trajectory, fit_grid, make_particles, vast_grid
 from pigjax.metrics import boundary_iou, mean_iou, psnr, ssim
@@ -65,10 +76,12 @@ __all__ = [
     "contributions",
     "deform",
     "eigen_clamp",
+    "evaluate_labels",
     "fill_unseen",
     "fit_grid",
     "interpolate_path",
     "lift_masks",
+    "load_dataset",
     "load_gaussians",
     "load_masks",
     "load_ply",

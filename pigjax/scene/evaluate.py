@@ -16,8 +16,8 @@ from pigjax.evaluation import Evaluation, evaluate_labels, ground_prompts, pixel
 from pigjax.io.files import existing
 from pigjax.metrics import mean_iou
 from pigjax.overlay import comparison_sheet
-from pigjax.segmentation import Labels, enough_capacity, fill_unseen, lift_masks
-from pigjax.splat import Gaussians, RenderConfig
+from pigjax.segmentation import Labels, fill_unseen, lift_masks
+from pigjax.splat import Gaussians
 
 _MOST_ROWS = 24
 
@@ -68,10 +68,9 @@ def evaluate_files(
     lifted = fill_unseen(gaussians, lifted) if fill else lifted
     progress("lift", 1, 1)
     cameras = {view: dataset.test.cameras[i] for i, view in enumerate(dataset.test.names)}
-    config = enough_capacity(gaussians, dataset.test.cameras, RenderConfig())
-    objects, grounding = _grounding(gaussians, lifted, dataset, cameras, prompts, reference, config)
+    objects, grounding = _grounding(gaussians, lifted, dataset, cameras, prompts, reference)
     evaluation = evaluate_labels(
-        gaussians, lifted, cameras, dataset.truths, objects, config=config,
+        gaussians, lifted, cameras, dataset.truths, objects,
         progress=lambda done, of: progress("draw", done, of),
     )  # fmt: skip
     views = {prompt: sum(at == prompt for _, at in dataset.truths) for prompt in objects}
@@ -110,7 +109,6 @@ def _grounding(
     cameras: dict[str, Any],
     prompts: Path | None,
     reference: str | None,
-    config: RenderConfig,
 ) -> tuple[dict[str, int | None], str]:
     """Id of each prompt, and in words how it was found."""
     wanted = list(dict.fromkeys(prompt for _, prompt in dataset.truths))
@@ -123,7 +121,7 @@ def _grounding(
     view = reference_view(dataset.truths) if reference is None else reference
     if view not in cameras:
         raise InputError(f"reference = {view!r}: no view with truth; choose among {', '.join(cameras)}.")
-    ids, _ = pixel_ids(gaussians, labels, cameras[view], config=config)
+    ids, _ = pixel_ids(gaussians, labels, cameras[view])
     truths = {prompt: mask for (at, prompt), mask in dataset.truths.items() if at == view}
     found = ground_prompts(ids, truths)
     return {prompt: found.get(prompt) for prompt in wanted}, f"best overlap with the truth in view {view}"
