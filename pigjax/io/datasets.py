@@ -61,7 +61,8 @@ def load_dataset(
       {id: name}.
 
     Pictures of zeros and ones are masks as well. Views with truth never vote. As in Gaussian Grouping's data, where
-    `object_mask` of the test views is black, a view that is black all over does not vote, nor is a black truth scored.
+    `object_mask` of the test views is black, a view that is black all over or has no mask does not vote, nor is a black
+    truth scored.
 
     Args:
         path: folder of the scene, with cameras that `load_views` knows.
@@ -79,7 +80,7 @@ def load_dataset(
         raise InputError(f"format = {layout!r}: choose from {', '.join(LAYOUTS)}.")
     root = existing_folder(path, "data set")
     cameras, views = load_cameras(root, max_size=max_size)
-    found = LAYOUTS[layout](root, frame_order(views))
+    found = LAYOUTS[layout](root, sorted(views))
     truths = {key: mask for key, mask in found.masks.items() if mask.any()}
     if not truths:
         raise InputError(f"{root}: no truth mask of its {len(found.masks)} shows anything; check the test views.")
@@ -96,7 +97,7 @@ def load_dataset(
         (cameras.width, cameras.height),
         holes=holes,
         frames=frame_order(views),
-        missing="error" if layout == "views" else "empty",
+        missing="empty",
     )
     says = np.any(ids, (1, 2))
     if not says.any():
@@ -153,9 +154,8 @@ def _3d_ovs(root: Path, views: Sequence[str]) -> _Truths:
     truths = existing_folder(root / "segmentations", "folder of truth masks (3D-OVS)")
     lines = existing(truths / "classes.txt", "list of classes").read_text(encoding="utf-8").splitlines()
     classes = sorted({line.strip() for line in lines} - {""})
-    photos = sorted(
-        p.stem for p in existing_folder(root / "images", "folder of photos").iterdir() if p.suffix.lower() in _PHOTOS
-    )
+    files = sorted(existing_folder(root / "images", "folder of photos").iterdir())
+    photos = [file.stem for file in files if file.suffix.lower() in _PHOTOS]
     masks: dict[tuple[str, str], Truth] = {}
     for folder in sorted(folder for folder in truths.iterdir() if folder.is_dir()):
         if not folder.name.isdigit() or int(folder.name) >= len(photos):

@@ -20,6 +20,7 @@ from pigjax.segmentation import Labels, fill_unseen, lift_masks
 from pigjax.splat import Gaussians
 
 _MOST_ROWS = 24
+_MOST_IDS = 65536  # votes are counted per Gaussian and id
 
 
 class Report(NamedTuple):
@@ -84,6 +85,11 @@ def _lift(gaussians: Gaussians, dataset: io.Dataset, tau_T: float, tau_d: float)
     if dataset.masks is None or dataset.cameras is None:
         raise InputError("the data set was read without masks that vote; give labels.npz, or read it with vote=True.")
     num_ids = int(dataset.masks.max()) + 1
+    if num_ids > _MOST_IDS:
+        raise InputError(
+            f"masks hold the id {num_ids - 1}, which numbers annotations rather than objects; give the objects ids"
+            f" below {_MOST_IDS} that are the same in all views."
+        )
     return lift_masks(gaussians, dataset.cameras, dataset.masks, num_ids=num_ids, tau_T=tau_T, tau_d=tau_d)
 
 
