@@ -11,7 +11,18 @@ from pigjax.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sph
 from pigjax.contact import BodyContact
 from pigjax.editing import extract_object, hole_mask, remove_object
 from pigjax.errors import InputError, MissingFileError, SceneError, SimulationError
-from pigjax.io import Views, load_gaussians, load_masks, load_ply, load_points, load_views, save_ply, write_video
+from pigjax.evaluation import evaluate_labels
+from pigjax.io import (
+    Views,
+    load_dataset,
+    load_gaussians,
+    load_masks,
+    load_ply,
+    load_points,
+    load_views,
+    save_ply,
+    write_video,
+)
 from pigjax.materials import Material, MaterialTable, material_table, preset
 from pigjax.matter import Grid, Health, Particles, Trajectory, fit_grid, make_particles, vast_grid
 from pigjax.metrics import boundary_iou, mean_iou, psnr, ssim
@@ -66,12 +77,14 @@ __all__ = [
     "contributions",
     "deform",
     "eigen_clamp",
+    "evaluate_labels",
     "extract_object",
     "fill_unseen",
     "fit_grid",
     "hole_mask",
     "interpolate_path",
     "lift_masks",
+    "load_dataset",
     "load_gaussians",
     "load_masks",
     "load_ply",

@@ -225,6 +225,60 @@ def segment(
 
 
 @app.command()
+def evaluate(
+    dataset: Annotated[Path, typer.Argument(help="Folder of a labelled scene.")],
+    gaussians: Annotated[Path, typer.Argument(help="Trained .ply, .splat or .spz of it.")],
+    layout: Annotated[str, typer.Option("--format", help="lerf-mask, 3d-ovs, or views.")],
+    out: Out = Path("evaluation"),
+    masks: Annotated[Path | None, typer.Option(help="Folder or JSON of the masks to lift, if not object_mask.")] = None,
+    labels: Annotated[Path | None, typer.Option(help="labels.npz of 'pigjax segment', instead of lifting.")] = None,
+    prompts: Annotated[Path | None, typer.Option(help="JSON {prompt: id}.")] = None,
+    reference: Annotated[str | None, typer.Option(help="View whose truth gives each prompt its object.")] = None,
+    tau_t: Annotated[float, typer.Option(help="Transmittance that marks the surface.", min=0, max=1)] = 0.5,
+    tau_d: Annotated[float, typer.Option(help="Relative depth tolerance of a vote.", min=0, max=1)] = 0.03,
+    fill: Annotated[bool, typer.Option(help="Give unseen Gaussians the id of their neighbours.")] = True,
+    holes: Annotated[int, typer.Option(help="Close holes of up to this many pixels in the masks.", min=0)] = 0,
+    max_size: Annotated[int | None, typer.Option(help="Shrink photos to this many pixels.")] = None,
+) -> None:
+    """Score objects against true masks (mIoU, mBIoU); writes OUT/scores.json and OUT/sheet.png."""
+    from pigjax import io
+    from pigjax.scene.evaluate import evaluate_files
+
+    cloud = io.load_gaussians(gaussians)
+    read = io.load_dataset(dataset, layout, masks=masks, vote=labels is None, max_size=max_size, holes=holes)
+    with _progress() as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def tell(stage: str, done: int, of: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=of)
+            bar.update(tasks[stage], completed=done)
+
+        report = evaluate_files(
+            cloud, read, out, labels=labels, prompts=prompts, reference=reference,
+            tau_T=tau_t, tau_d=tau_d, fill=fill, progress=tell,
+        )  # fmt: skip
+    scores = report.evaluation.scores
+    table = Table("prompt", "object", "views", *(f"{level} mIoU / mBIoU %" for level in scores))
+    for prompt, number in report.evaluation.objects.items():
+        cells = [_percent(*score.per_prompt[prompt]) for score in scores.values()]
+        table.add_row(escape(prompt), "missing" if number is None else str(number), str(report.views[prompt]), *cells)
+    table.add_section()
+    table.add_row("mean", "", "", *(_percent(score.mean_iou, score.mean_boundary_iou) for score in scores.values()))
+    _console.print(table)
+    missing = next(iter(scores.values())).missing
+    _console.print(
+        f"prompts by {report.grounding}; {missing} masks missing, scored 0; {len(report.black)} black ones left out;"
+        f" written to {out}",
+        highlight=False, markup=False,
+    )  # fmt: skip
+
+
+def _percent(iou: float, boundary_iou: float) -> str:
+    return f"{100 * iou:.1f} / {100 * boundary_iou:.1f}"
+
+
+@app.command()
 def info(path: Annotated[Path, typer.Argument(help="A .ply, .splat or .spz, a scene file, or posed photos.")]) -> None:
     """Say what a file holds."""
     from pigjax.scene.objects import describe_file

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from functools import partial, reduce
 from typing import Any, NamedTuple
 
@@ -137,8 +137,8 @@ class MaskScores(NamedTuple):
 
 
 def score_masks(
-    predictions: Mapping[tuple[Hashable, Hashable], Any],
-    truths: Mapping[tuple[Hashable, Hashable], Any],
+    predictions: Mapping[tuple[Any, Any], Any],
+    truths: Mapping[tuple[Any, Any], Any],
     *,
     dilation_ratio: float = 0.02,
 ) -> MaskScores:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Integer, Num, UInt8
+from jaxtyping import Array, Bool, Float, Int, Integer, Num, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from pigjax.errors import InputError
@@ -83,6 +84,48 @@ def legend_sheet(
             left += row_height
         draw.text((left, middle), f"{object_id}  {name}", fill="black", font=font, anchor="lm")
     return np.asarray(sheet)
+
+
+def comparison_sheet(
+    rows: Iterable[tuple[str, Num[Array | np.ndarray, "h w 3"], Bool[np.ndarray, "_ _"], Bool[np.ndarray, "_ _"]]],
+    *,
+    height: int = 128,
+) -> UInt8[np.ndarray, "rows width 3"]:
+    """Masks beside their truth, a row for each: image, truth, ours, and where they differ, host.
+
+    In the difference green is right, red is ours alone, blue is the truth's alone. Masks of any size take the size of
+    the image.
+
+    Args:
+        rows: title, image, truth and our mask.
+        height: of one picture [px].
+    """
+    parts = [
+        _labelled_strip("image  |  truth  |  ours  |  green right, red ours alone, blue missed", [], 0, 4 * height)
+    ]
+    for title, image, truth, ours in rows:
+        picture = _bytes(np.asarray(image))
+        width = max(round(picture.shape[1] * height / picture.shape[0]), 1)
+        true, our = (np.asarray(_scaled(255 * mask.astype(np.uint8), width, height)) > 127 for mask in (truth, ours))
+        difference = np.stack([our & ~true, our & true, true & ~our], -1)
+        panels = [_scaled(picture, width, height), *(np.repeat(255 * m[..., None], 3, 2) for m in (true, our))]
+        parts.append(_labelled_strip(title, [*panels, 255 * difference], height, width))
+    widest = max(part.shape[1] for part in parts)
+    widened = [np.pad(part, ((0, 0), (0, widest - part.shape[1]), (0, 0)), constant_values=255) for part in parts]
+    return np.concatenate(widened)
+
+
+def _labelled_strip(title: str, panels: Sequence[Any], height: int, width: int) -> UInt8[np.ndarray, "rows columns 3"]:
+    strip = Image.new("RGB", (max(len(panels), 1) * (width + 4), height + 24), "white")
+    for i, panel in enumerate(panels):
+        strip.paste(Image.fromarray(np.asarray(panel, np.uint8)), (i * (width + 4), 20))
+    ImageDraw.Draw(strip).text((2, 10), title, fill="black", font=ImageFont.load_default(size=14), anchor="lm")
+    return np.asarray(strip)
+
+
+def _scaled(pixels: np.ndarray, width: int, height: int) -> Image.Image:
+    way = Image.Resampling.NEAREST if pixels.ndim == 2 else Image.Resampling.BOX
+    return Image.fromarray(pixels).resize((width, height), way)
 
 
 def _thumbnail(image: np.ndarray, member: np.ndarray, size: int) -> Image.Image | None:

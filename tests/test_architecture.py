@@ -23,7 +23,7 @@ FLOORS = [
     {"boxes"},
     {"mls_mpm"},
     {"segmentation", "particles", "solids", "reconstruct", "pruning"},
-    {"editing"},
+    {"editing", "evaluation"},
     {"scene"},
     {"cli"},
     {"__main__"},
@@ -31,7 +31,7 @@ FLOORS = [
 FLOOR_OF = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
 # the two worlds meet in particles.py and solids.py only
 SPLATS = {"splat", "lists", "footprints", "chunks", "bands", "tiles", "tile_walks", "clamp", "segmentation"}
-SPLATS |= {"starts", "relocation", "reconstruct", "filling", "shells", "pruning", "editing"}
+SPLATS |= {"starts", "relocation", "reconstruct", "filling", "shells", "pruning", "editing", "evaluation"}
 MATTER = {
     "matter",
     "mls_mpm",

@@ -323,3 +323,26 @@ def test_mask_missing_for_a_view(tmp_path):
         load_views(folder, masks=True)
     views = load_views(folder, masks=folder / "object_mask", missing_masks="empty", merge={1: 4})
     assert [int(mask.max()) for mask in views.masks] == [4, 0]
+
+
+def test_tracks_count_all_photos_though_few_are_loaded(tmp_path):
+    transforms(tmp_path, count=3, test_filenames=["images/002.png"])
+    full = {"size": [30, 40], "counts": [0, 1200]}
+    (tmp_path / "tracks.json").write_text(json.dumps({str(i): {str(i + 5): full} for i in range(3)}))
+    views = load_views(tmp_path, masks=tmp_path / "tracks.json", split="test")
+    assert np.unique(views.masks).tolist() == [7]
+    views = load_views(tmp_path, masks=tmp_path / "tracks.json", only=("001",))
+    assert views.names == ("001",)
+    assert np.unique(views.masks).tolist() == [6]
+    with pytest.raises(InputError, match=r"has no view '009' to load; choose among 000, 001, 002"):
+        load_views(tmp_path, only=("001", "009"))
+
+
+def test_holes_of_masks_are_closed_on_loading(tmp_path):
+    transforms(tmp_path, count=1)
+    mask = np.full((30, 40), 4, np.uint8)
+    mask[10, 10:12] = 0
+    (tmp_path / "object_mask").mkdir()
+    Image.fromarray(mask).save(tmp_path / "object_mask/000.png")
+    assert (load_views(tmp_path, masks=True, holes=1).masks == 0).sum() == 2
+    assert (load_views(tmp_path, masks=True, holes=2).masks == 0).sum() == 0

@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 from scipy import ndimage
 
 from pigjax.errors import InputError
@@ -104,6 +105,27 @@ def test_boundary_iou_of_hand_made_masks():
     assert float(boundary_iou(full, square(40, 1, 1, 38, 38))) == 0.0
 
 
+def test_wide_boundaries_of_hand_made_masks():
+    # diagonal of 120x90 is 150: d = 3, so the band of a 20x20 square is what its inner 14x14 leaves: 204 px
+    truth, moved = np.zeros((2, 120, 90), bool)
+    truth[30:50, 30:50], moved[30:50, 32:52] = True, True
+    inner, inner_moved = np.zeros((2, 120, 90), bool)
+    inner[33:47, 33:47], inner_moved[33:47, 35:49] = True, True
+    assert (truth & ~inner).sum() == 204
+    shared = (truth & ~inner & moved & ~inner_moved).sum()
+    # two bars of 3x18 at top and bottom, and between them, 14 px high, the columns 32 (left) and 49 (right) of both
+    assert shared == 2 * 3 * 18 + 14 * 2
+    assert float(boundary_iou(moved, truth)) == pytest.approx(shared / (2 * 204 - shared))
+    assert float(mean_iou(moved, truth)) == pytest.approx(18 / 22)
+    # at the image's edge the mask ends, too: a band of 3 px along it
+    corner = np.zeros((120, 90), bool)
+    corner[:10, :10] = True
+    rest = np.zeros((120, 90), bool)
+    rest[3:7, 3:7] = True
+    assert float(boundary_iou(corner & ~rest, corner)) == pytest.approx(1.0)
+    assert float(boundary_iou(rest, corner)) == 0.0
+
+
 @pytest.mark.parametrize(("shape", "ratio"), [((30, 50), 0.02), ((30, 50), 0.3), ((137, 201), 0.02)])
 def test_boundary_equals_repeated_erosion_by_scipy(shape, ratio):
     rng = np.random.default_rng(0)
@@ -115,8 +137,6 @@ def test_boundary_equals_repeated_erosion_by_scipy(shape, ratio):
 
 
 def test_prediction_of_another_size_is_resized_by_nearest_pixel():
-    from PIL import Image
-
     rng = np.random.default_rng(0)
     small = ndimage.gaussian_filter(rng.random((23, 31)), 2) > 0.5
     truth = ndimage.gaussian_filter(rng.random((60, 50)), 4) > 0.5
@@ -136,3 +156,43 @@ def test_scores_average_views_then_prompts_and_count_the_missing():
     assert scores.mean_boundary_iou == pytest.approx(boundaries / 2)
     with pytest.raises(InputError, match="truths"):
         score_masks(predictions, {})
+
+
+def published_scores(predictions, truths):
+    """Gaussian Grouping's protocol anew: 8-bit masks cut at 128, Pillow's nearest pixel, scipy's erosion, float64."""
+    by_prompt = {}
+    for (view, prompt), truth in truths.items():
+        if (view, prompt) not in predictions:
+            by_prompt.setdefault(prompt, []).append((0.0, 0.0))
+            continue
+        height, width = truth.shape
+        grey = Image.fromarray((255 * predictions[view, prompt]).astype(np.uint8))
+        prediction = np.asarray(grey.resize((width, height), Image.Resampling.NEAREST)) > 128
+        steps = max(round(0.02 * np.hypot(height, width)), 1)
+        element = np.ones((3, 3))
+        edges = [
+            mask & ~ndimage.binary_erosion(np.pad(mask, 1), element, steps)[1:-1, 1:-1] for mask in (prediction, truth)
+        ]
+        pairs = (prediction, truth), edges
+        by_prompt.setdefault(prompt, []).append(tuple((a & b).sum() / (a | b).sum() for a, b in pairs))
+    per_prompt = {prompt: np.mean(scores, 0) for prompt, scores in by_prompt.items()}
+    return per_prompt, np.mean(list(per_prompt.values()), 0)
+
+
+def test_scores_equal_the_published_protocol_written_anew():
+    rng = np.random.default_rng(0)
+
+    def blob(shape):
+        return ndimage.gaussian_filter(rng.random(shape), 4) > 0.5
+
+    truths = {(view, prompt): blob((61, 84)) for view in "abc" for prompt in ("sheep", "tea")}
+    truths.pop(("b", "tea"))
+    predictions = {key: blob((61, 84)) | truth for key, truth in truths.items()}
+    predictions["a", "sheep"] = ndimage.binary_dilation(truths["a", "sheep"], iterations=2)[::2, ::2]
+    predictions.pop(("c", "tea"))
+    scores = score_masks(predictions, truths)
+    per_prompt, means = published_scores(predictions, truths)
+    for prompt, expected in per_prompt.items():
+        assert scores.per_prompt[prompt] == pytest.approx(tuple(expected), abs=1e-6)
+    assert (scores.mean_iou, scores.mean_boundary_iou) == pytest.approx(tuple(means), abs=1e-6)
+    assert scores.missing == 1

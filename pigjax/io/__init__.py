@@ -1,6 +1,7 @@
 """Files: the only package that touches them. Everything here runs on the host."""
 
 from pigjax.io.cameras import Views, load_cameras, load_views
+from pigjax.io.datasets import LAYOUTS, Dataset, load_dataset
 from pigjax.io.files import read_json, write_json
 from pigjax.io.formats import load_gaussians
 from pigjax.io.images import contact_sheet, read_image, write_image
@@ -10,10 +11,13 @@ from pigjax.io.state import last_state, load_pytree, load_state, save_pytree, sa
 from pigjax.io.video import write_video
 
 __all__ = [
+    "LAYOUTS",
+    "Dataset",
     "Views",
     "contact_sheet",
     "last_state",
     "load_cameras",
+    "load_dataset",
     "load_gaussians",
     "load_masks",
     "load_ply",

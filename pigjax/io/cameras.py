@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from pigjax.io.colmap import find_model, read_model
 from pigjax.io.files import PathLike, existing, existing_folder, read_json
 from pigjax.io.images import Background, open_rgb
 from pigjax.io.json_cameras import read_inria_cameras, read_transforms
+from pigjax.io.mask_json import frame_order
 from pigjax.io.masks import load_masks
 
 
@@ -67,7 +69,9 @@ def load_views(
     masks: PathLike | bool | None = None,
     merge: Mapping[int, int] | None = None,
     missing_masks: str = "error",
+    holes: int = 0,
     split: str | None = None,
+    only: Sequence[str] | None = None,
     max_size: int | None = None,
     hold_out: int = 8,
     background: Background = 0.0,
@@ -80,10 +84,12 @@ def load_views(
     Args:
         path: one of these files, or the folder that holds it.
         images: folder of the photos, where they are not where the file says (for COLMAP and INRIA: `images`).
-        masks: folder of instance masks (see `load_masks`); True means `object_mask` beside the photos' folder.
+        masks: folder or JSON of instance masks (see `load_masks`); True means `object_mask` beside the photos' folder.
         merge: mask ids to replace, {3: 2} turns 3 into 2.
         missing_masks: "error", or "empty": a view without a mask gets background everywhere.
+        holes: background of up to this many pixels that one object encloses becomes that object.
         split: load only the views of this split.
+        only: load only the views of these names.
         max_size: shrink photos so that neither side is longer [px]; intrinsics follow.
         hold_out: where the file assigns no splits, every n-th view is "test", from the first on, as in 3DGS; 0 or fewer
             views than that: all are "train".
@@ -92,25 +98,36 @@ def load_views(
     Raises:
         MissingFileError: the file or a photo or mask does not exist.
         InputError: unknown or damaged format, camera model that is no pinhole, pose that is not rigid, photos whose
-            size contradicts the camera or differs from view to view, or no views in the split.
+            size contradicts the camera or differs from view to view, no views in the split, or an unknown name.
     """
     capture = _read_capture(path, images)
     splits = _splits(capture, hold_out)
     chosen = range(len(splits)) if split is None else _of_split(splits, split, str(path))
+    all_names = _names([shot.image for shot in capture.shots])
+    if only is not None:
+        unknown = set(only) - {all_names[i] for i in chosen}
+        if unknown:
+            raise InputError(
+                f"{path}: has no view {min(unknown)!r} to load; choose among {', '.join(all_names[:4])}, ..."
+            )
+        chosen = [i for i in chosen if all_names[i] in only]
     shots = [capture.shots[i] for i in chosen]
     sizes = [_target_size(shot, max_size) for shot in shots]
     _check_one_size(shots, sizes)
     with ThreadPoolExecutor() as pool:
         pictures = list(pool.map(lambda shot, size: _picture(shot, size, background), shots, sizes))
-    all_names = _names([shot.image for shot in capture.shots])
     names = tuple(all_names[i] for i in chosen)
     home = capture.root if images is None else Path(images).parent
     folder = home / "object_mask" if masks is True else masks
+    ids = None
+    if folder:
+        options: dict[str, Any] = {"merge": merge, "missing": missing_masks, "holes": holes}
+        ids = load_masks(folder, names, sizes[0], frames=frame_order(all_names), **options)
     return Views(
         cameras=_cameras(shots, sizes),
         names=names,
         images=np.stack(pictures),
-        masks=load_masks(folder, names, sizes[0], merge=merge, missing=missing_masks) if folder else None,
+        masks=ids,
         splits=tuple(splits[i] for i in chosen),
         points_path=capture.points,
     )

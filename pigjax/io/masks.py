@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Array, Int, Integer
 from PIL import Image
+from scipy import ndimage
 
 from pigjax.errors import InputError, MissingFileError
-from pigjax.io.files import PathLike, existing_folder, read_json, writing
+from pigjax.io.files import PathLike, existing, existing_folder, read_json, writing
 from pigjax.io.images import open_image
+from pigjax.io.mask_json import Segments, frame_order, paint, read_view, read_views
 
 
 def load_masks(
@@ -22,39 +24,56 @@ def load_masks(
     *,
     merge: Mapping[int, int] | None = None,
     missing: str = "error",
+    holes: int = 0,
+    id_field: str | None = None,
+    frames: Sequence[str] | None = None,
 ) -> Int[np.ndarray, "t h w"]:
     """Object ids of every pixel, one mask per view. Host.
 
-    A mask is `<name>.png` with 8- or 16-bit ids (a palette's colours do not matter), `<name>.npy` [h, w], or an RGB
-    picture as DEVA writes it: id = R + 256 G + 65536 B, all ids listed in `pred.json` in the folder or above it.
-    A mask of another size is resized to the nearest pixel, and a warning says so.
+    A mask is `<name>.png` with 8- or 16-bit ids (a palette's colours do not matter), `<name>.npy` [h, w], an RGB
+    picture as DEVA writes it (id = R + 256 G + 65536 B, all ids listed in `pred.json` in the folder or above it), or
+    `<name>.json` with SAM's or COCO's annotations. One JSON may hold all views instead: COCO's, SAM 2's tracks
+    {frame: {id: run lengths}} with frames counted from 0 or named, or SA-V's, whose masklet k becomes id k + 1. In JSON
+    an object's id is its `object_id`, `instance_id` or `track_id`, else `id`, else its position counted from 1; where
+    masks overlap the smaller one wins.
+
+    A mask of another size is resized to the nearest pixel, and a warning says so. JSON is decoded by pycocotools:
+    `pip install 'pigjax[formats]'`.
 
     Args:
-        folder: where the masks are.
+        folder: where the masks are, or one JSON of all views (a folder may hold it alone).
         names: names of the views.
         size: width and height of the views [px].
         merge: ids to replace, all at once: {3: 2} turns 3 into 2.
         missing: "error", or "empty": a view without a mask gets background everywhere.
+        holes: background enclosed by one object alone becomes that object, where it has at most this many pixels of
+            the mask as stored.
+        id_field: field of a JSON annotation that is the object's id, such as "category_id".
+        frames: names of all views in the order in which a video tracker saw them; `frame_order` of `names` if
+            not given.
 
     Raises:
         MissingFileError: the folder, or the mask of a view, does not exist.
         InputError: a mask is damaged, has another aspect ratio than the view, or holds no ids.
     """
-    folder = existing_folder(folder, "folder of masks")
     if missing not in ("error", "empty"):
         raise InputError(f"missing = {missing!r}: choose 'error' or 'empty'.")
+    if holes < 0:
+        raise InputError(f"holes = {holes}: give the most pixels that a hole may have, or 0.")
+    find = _finder(folder, names, frame_order(names) if frames is None else frames, id_field)
     width, height = size
     masks = np.zeros((len(names), height, width), np.int32)
     resized = []
     for mask, name in zip(masks, names):
-        path = _find(folder, name)
-        if path is not None:
-            ids = _read_ids(path)
-            resized += [path] if ids.shape != mask.shape else []
-            mask[:] = _nearest(ids, size, path)
+        found = find(name)
+        if found is not None:
+            where, ids = _read_ids(found, (height, width))
+            resized += [where] if ids.shape != mask.shape else []
+            mask[:] = _nearest(_filled(ids, holes), size, where)
         elif missing == "error":
             raise MissingFileError(
-                f"{folder}: no mask for view '{name}' ({name}.png or {name}.npy); add it, or let it be 'empty'."
+                f"{folder}: no mask for view '{name}' ({name}.png or {name}.npy) nor in JSON; add it,"
+                " or let it be 'empty'."
             )
     if resized:
         warnings.warn(
@@ -79,20 +98,44 @@ def save_masks(folder: PathLike, names: Sequence[str], masks: Integer[np.ndarray
             Image.fromarray(mask.astype(np.uint8 if high < 256 else np.uint16)).save(partial)
 
 
-def _find(folder: Path, name: str) -> Path | None:
-    candidates = (folder / f"{name}{suffix}" for suffix in (".png", ".npy"))
-    return next((path for path in candidates if path.is_file()), None)
+def _finder(
+    folder: PathLike, names: Sequence[str], frames: Sequence[str], id_field: str | None
+) -> Callable[[str], Path | Segments | None]:
+    """What gives the file, or the annotations, of a view."""
+    if Path(folder).suffix.lower() == ".json":
+        return read_views(existing(folder, "JSON of masks"), frames, id_field).get
+    folder = existing_folder(folder, "folder of masks")
+    candidates = {name: [folder / f"{name}{suffix}" for suffix in (".png", ".npy", ".json")] for name in names}
+    files = {name: next((path for path in paths if path.is_file()), None) for name, paths in candidates.items()}
+    listings = [path for path in folder.glob("*.json") if path.name != "pred.json"]
+    if len(listings) == 1 and not any(files.values()):
+        return read_views(listings[0], frames, id_field).get
+
+    def find(name: str) -> Path | Segments | None:
+        path = files[name]
+        return read_view(path, id_field) if path is not None and path.suffix == ".json" else path
+
+    return find
 
 
-def _read_ids(path: Path) -> Int[np.ndarray, "h w"]:
-    ids = _read_array(path) if path.suffix == ".npy" else np.asarray(open_image(path))
-    if ids.ndim == 3:
-        ids = _deva_ids(path, ids)
+def _read_ids(found: Path | Segments, size: tuple[int, int]) -> tuple[Path | str, Int[np.ndarray, "h w"]]:
+    """Where the ids of a view come from, and the ids; `size` is the height and width of the view."""
+    if isinstance(found, list):
+        where: Path | str = found[0].where if found else ""
+        ids: np.ndarray = paint(found, size)
+        lowest = min((segment.object_id for segment in found), default=1)
+        if lowest < 1:
+            raise InputError(f"{where}: object id {lowest} is not > 0, which is the background; choose an id_field.")
+    else:
+        where = found
+        ids = _read_array(found) if found.suffix == ".npy" else np.asarray(open_image(found))
+        if ids.ndim == 3:
+            ids = _deva_ids(found, ids)
     if ids.ndim != 2 or not (np.issubdtype(ids.dtype, np.integer) or ids.dtype == bool):
-        raise InputError(f"{path}: mask is {ids.dtype} {ids.shape}; save whole-number ids [h, w].")
+        raise InputError(f"{where}: mask is {ids.dtype} {ids.shape}; save whole-number ids [h, w].")
     if ids.size and not 0 <= ids.min() <= ids.max() < 2**31:
-        raise InputError(f"{path}: mask ids reach from {ids.min()} to {ids.max()}; use 0 (background) to 2³¹ - 1.")
-    return ids.astype(np.int32)
+        raise InputError(f"{where}: mask ids reach from {ids.min()} to {ids.max()}; use 0 (background) to 2³¹ - 1.")
+    return where, ids.astype(np.int32)
 
 
 def _read_array(path: Path) -> np.ndarray:
@@ -122,7 +165,23 @@ def _deva_ids(path: Path, rgb: np.ndarray) -> Int[np.ndarray, "h w"]:
     return ids
 
 
-def _nearest(ids: np.ndarray, size: tuple[int, int], path: Path) -> np.ndarray:
+def _filled(ids: Int[np.ndarray, "h w"], most: int) -> Int[np.ndarray, "h w"]:
+    """Ids with the holes of up to `most` pixels closed: pieces of background that touch one object and no edge."""
+    if most == 0:
+        return ids
+    pieces, count = ndimage.label(ids == 0)
+    cross = ndimage.generate_binary_structure(2, 1)
+    # beyond the edge stands an id of its own, so that a piece at the edge touches two
+    highest = ndimage.maximum_filter(ids, footprint=cross, mode="constant", cval=np.iinfo(np.int32).max)
+    owned = np.where(ids == 0, np.iinfo(np.int32).max, ids)
+    lowest = ndimage.minimum_filter(owned, footprint=cross, mode="constant", cval=np.iinfo(np.int32).max)
+    numbers = np.arange(1, count + 1)
+    owner = ndimage.maximum(highest, pieces, numbers).astype(np.int32)
+    closed = (owner == ndimage.minimum(lowest, pieces, numbers)) & (np.bincount(pieces.ravel())[1:] <= most)
+    return ids + np.append(0, np.where(closed, owner, 0)).astype(np.int32)[pieces]
+
+
+def _nearest(ids: np.ndarray, size: tuple[int, int], path: Path | str) -> np.ndarray:
     width, height = size
     rows, columns = ids.shape
     # One pixel of rounding is fair on either side; more means that the mask is of another picture.

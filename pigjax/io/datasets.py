@@ -1,0 +1,192 @@
+"""Labelled scenes for evaluation: LERF-Mask, 3D-OVS, and any posed photos with masks and names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from pigjax.camera import Camera
+from pigjax.errors import InputError
+from pigjax.io.cameras import Views, load_cameras, load_views
+from pigjax.io.files import PathLike, existing, existing_folder, read_json
+from pigjax.io.images import open_image
+from pigjax.io.mask_json import frame_order
+from pigjax.io.masks import load_masks
+
+Truth = Bool[np.ndarray, "_ _"]  # of the size that it is stored in
+_PHOTOS = (".png", ".jpg", ".jpeg")
+_HOLD_OUT = 8
+
+
+class Dataset(NamedTuple):
+    """A scene with views that vote, and views whose truth is known."""
+
+    cameras: Camera | None  # views that vote, batch of t
+    masks: Int[np.ndarray, "t h w"] | None  # their object ids
+    test: Views  # views with truth
+    truths: dict[tuple[str, str], Truth]  # by (view, prompt)
+    names: dict[int, str]  # names of the ids in `masks`, where the data set has them
+    black: tuple[str, ...]  # views that do not vote and truths that are not scored, since they are black all over
+
+
+class _Truths(NamedTuple):
+    """What each layout comes down to."""
+
+    test: list[str]  # views that must not vote
+    masks: dict[tuple[str, str], Truth]
+    names: dict[int, str]  # of the ids in `object_mask`
+
+
+def load_dataset(
+    path: PathLike,
+    layout: str,
+    *,
+    masks: PathLike | None = None,
+    vote: bool = True,
+    max_size: int | None = None,
+    holes: int = 0,
+) -> Dataset:
+    """Views that vote, and truth by (view, prompt), of a labelled scene. Host.
+
+    - "lerf-mask" (Gaussian Grouping, Ye et al. 2024): `test_mask/<view>/<prompt>.png`, where a view is named, or
+      counted among the test views in the order of names; these are the photos that are not in `images_train`, or every
+      eighth where there is no such folder. A mask is where a pixel is > 128.
+    - "3d-ovs" (Liu et al. 2023): `segmentations/classes.txt` and `segmentations/<number>/<class>.png`, where the number
+      counts the files in `images` in the order of names. A mask is where a pixel is 255.
+    - "views": any posed photos; truth is what `object_mask` holds in the test split, with the names of `names.json`
+      {id: name}.
+
+    Pictures of zeros and ones are masks as well. Views with truth never vote. As in Gaussian Grouping's data, where
+    `object_mask` of the test views is black, a view that is black all over or has no mask does not vote, nor is a black
+    truth scored.
+
+    Args:
+        path: folder of the scene, with cameras that `load_views` knows.
+        layout: "lerf-mask", "3d-ovs" or "views".
+        masks: folder or JSON of the masks that vote (see `load_masks`); `object_mask` of the scene if not given.
+        vote: False leaves them unread.
+        max_size: shrink photos so that neither side is longer [px].
+        holes: see `load_masks`.
+
+    Raises:
+        MissingFileError: a file or folder of the layout does not exist.
+        InputError: unknown layout, a damaged file, or nothing can vote or be scored.
+    """
+    if layout not in LAYOUTS:
+        raise InputError(f"format = {layout!r}: choose from {', '.join(LAYOUTS)}.")
+    root = existing_folder(path, "data set")
+    cameras, views = load_cameras(root, max_size=max_size)
+    found = LAYOUTS[layout](root, sorted(views))
+    truths = {key: mask for key, mask in found.masks.items() if mask.any()}
+    if not truths:
+        raise InputError(f"{root}: no truth mask of its {len(found.masks)} shows anything; check the test views.")
+    black = [f"truth {view}/{prompt}" for view, prompt in found.masks if (view, prompt) not in truths]
+    with_truth = {view for view, _ in truths}
+    test = load_views(root, only=[view for view in views if view in with_truth], max_size=max_size)
+    names = found.names if masks is None else {}
+    if not vote:
+        return Dataset(None, None, test, truths, names, tuple(black))
+    voters = [i for i, view in enumerate(views) if view not in found.test]
+    ids = load_masks(
+        root / "object_mask" if masks is None else masks,
+        [views[i] for i in voters],
+        (cameras.width, cameras.height),
+        holes=holes,
+        frames=frame_order(views),
+        missing="empty",
+    )
+    says = np.any(ids, (1, 2))
+    if not says.any():
+        raise InputError(
+            f"{root}: all masks of the {len(voters)} training views are black or missing; nothing can vote."
+        )
+    black += [f"view {views[i]}" for i, speaks in zip(voters, says.tolist()) if not speaks]
+    return Dataset(cameras[np.array(voters)[says]], ids[says], test, truths, names, tuple(black))
+
+
+def load_names(path: PathLike) -> dict[int, str]:
+    """Names of ids from JSON {id: name}.
+
+    Raises:
+        MissingFileError: there is no such file.
+        InputError: the file is no JSON of that form.
+    """
+    content = read_json(path)
+    try:
+        return {int(number): str(name) for number, name in content.items()}
+    except (AttributeError, ValueError):
+        raise InputError(f'{path}: is not {{id: name}}; write for example {{"1": "table"}}.') from None
+
+
+def _lerf_mask(root: Path, views: Sequence[str]) -> _Truths:
+    truths = existing_folder(root / "test_mask", "folder of truth masks (LERF-Mask)")
+    folders = sorted(folder for folder in truths.iterdir() if folder.is_dir())
+    train = root / "images_train"
+    if train.is_dir():
+        kept = {photo.stem for photo in train.iterdir()}
+        test = [view for view in views if view not in kept]
+    elif all(folder.name in views for folder in folders):
+        test = [folder.name for folder in folders]
+    else:
+        test = list(views[::_HOLD_OUT])
+    masks = {
+        (_view_of(folder, views, test), file.stem): _truth(file, above=128)
+        for folder in folders
+        for file in sorted(folder.glob("*.png"))
+    }
+    listing = root / "names.json"
+    return _Truths([*test, *(view for view, _ in masks)], masks, load_names(listing) if listing.is_file() else {})
+
+
+def _view_of(folder: Path, views: Sequence[str], test: Sequence[str]) -> str:
+    if folder.name in views:
+        return folder.name
+    if folder.name.isdigit() and int(folder.name) < len(test):
+        return test[int(folder.name)]
+    raise InputError(f"{folder}: is no view: neither a name nor a number from 0 to {len(test) - 1} of the test views.")
+
+
+def _3d_ovs(root: Path, views: Sequence[str]) -> _Truths:
+    truths = existing_folder(root / "segmentations", "folder of truth masks (3D-OVS)")
+    lines = existing(truths / "classes.txt", "list of classes").read_text(encoding="utf-8").splitlines()
+    classes = sorted({line.strip() for line in lines} - {""})
+    files = sorted(existing_folder(root / "images", "folder of photos").iterdir())
+    photos = [file.stem for file in files if file.suffix.lower() in _PHOTOS]
+    masks: dict[tuple[str, str], Truth] = {}
+    for folder in sorted(folder for folder in truths.iterdir() if folder.is_dir()):
+        if not folder.name.isdigit() or int(folder.name) >= len(photos):
+            raise InputError(f"{folder}: is no number of a photo, from 0 to {len(photos) - 1} in the order of names.")
+        view = photos[int(folder.name)]
+        if view not in views:
+            raise InputError(f"{folder}: photo {view!r} has no camera; pose it, or remove the folder.")
+        masks |= {(view, name): _truth(existing(folder / f"{name}.png", "truth mask"), above=254) for name in classes}
+    return _Truths([view for view, _ in masks], masks, {})
+
+
+def _labelled_views(root: Path, views: Sequence[str]) -> _Truths:
+    names = load_names(root / "names.json")
+    test = load_views(root, masks=True, split="test")
+    assert test.masks is not None
+    masks = {
+        (view, name): np.asarray(mask) == number
+        for number, name in names.items()
+        for view, mask in zip(test.names, test.masks)
+        if number > 0 and np.any(mask == number)  # an object that a view does not show is no black truth
+    }
+    return _Truths(list(test.names), masks, names)
+
+
+LAYOUTS: dict[str, Callable[[Path, Sequence[str]], _Truths]] = {
+    "lerf-mask": _lerf_mask,
+    "3d-ovs": _3d_ovs,
+    "views": _labelled_views,
+}
+
+
+def _truth(path: Path, *, above: int) -> Truth:
+    grey = np.asarray(open_image(path).convert("L"))
+    return grey > (0 if grey.max(initial=0) == 1 else above)

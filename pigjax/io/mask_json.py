@@ -1,0 +1,279 @@
+"""Masks in JSON: run lengths and polygons of COCO, and what SAM and SAM 2 write with them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path, PurePath
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from pigjax.errors import InputError
+from pigjax.io.files import read_json
+
+_OBJECT_FIELDS = ("object_id", "instance_id", "track_id")  # they follow an object through the views, `id` may not
+_LONGEST = 65536  # [px]
+
+
+class Segment(NamedTuple):
+    """One object in one view."""
+
+    object_id: int
+    shape: Any  # COCO's `segmentation`: {size, counts}, or a list of polygons
+    size: tuple[int, int] | None  # height and width of the picture, for polygons, where the file says it
+    where: str  # file and entry, for messages
+
+
+Segments = list[Segment]
+
+
+def read_view(path: Path, id_field: str | None) -> Segments:
+    """Objects of one view: SAM's annotations with or without `image`, a COCO file of one picture, or {id: run lengths}.
+
+    Raises:
+        InputError: the file is damaged or of another kind.
+    """
+    content = read_json(path)
+    if isinstance(content, list):
+        return list(_annotated(content, path, {}, id_field))
+    if isinstance(content, dict) and "annotations" in content:
+        pictures = content.get("images") or [content.get("image")]
+        return list(_annotated(_list(content, "annotations", path), path, _dict(pictures[0]), id_field))
+    if isinstance(content, dict) and all(_is_number(key) for key in content):
+        return list(_tracked(content, str(path)))
+    raise InputError(
+        f"{path}: holds no masks of one view; give a list of annotations, an object with 'annotations', or {{id: RLE}}."
+    )
+
+
+def read_views(path: Path, frames: Sequence[str], id_field: str | None) -> dict[str, Segments]:
+    """Objects of all views: a COCO file, SAM 2's tracks {frame: {id: run lengths}}, or a file of SA-V.
+
+    Args:
+        path: the file.
+        frames: names of all views, in the order in which the tracker saw them.
+        id_field: field of an annotation that is the object's id.
+
+    Raises:
+        InputError: the file is damaged or of another kind, or a frame is no view.
+    """
+    content = read_json(path)
+    if isinstance(content, dict) and "images" in content and "annotations" in content:
+        return _coco(content, path, frames, id_field)
+    if isinstance(content, dict) and "masklet" in content:
+        return _sa_v(content, path, frames)
+    if isinstance(content, dict) and content and all(isinstance(value, dict) for value in content.values()):
+        keys = _views_of(list(content), frames, path)
+        return {keys[key]: list(_tracked(found, f"{path}: frame {key}")) for key, found in content.items()}
+    raise InputError(
+        f"{path}: holds no masks of many views; give COCO's JSON ('images' and 'annotations'), SAM 2's tracks"
+        " ({frame: {id: RLE}}) or SA-V's 'masklet'."
+    )
+
+
+def paint(segments: Segments, size: tuple[int, int]) -> Int[np.ndarray, "h w"]:
+    """Ids of every pixel. Where masks overlap the smaller one wins, of equal ones the lower id.
+
+    Args:
+        segments: objects of one view.
+        size: height and width for polygons of a file that does not say them [px].
+
+    Raises:
+        InputError: a mask is damaged, masks of the view differ in size, or pycocotools is missing.
+    """
+    if not segments:
+        return np.zeros(size, np.int32)
+    coco = _pycocotools(segments[0].where)
+    masks = [_encoded(coco, segment, size) for segment in segments]
+    for segment, mask in zip(segments, masks):
+        if mask["size"] != masks[0]["size"]:
+            raise InputError(
+                f"{segment.where}: mask is {mask['size']} [height, width] but another of this view is"
+                f" {masks[0]['size']}; write the masks of a view in one size."
+            )
+    ids = np.zeros(masks[0]["size"], np.int32)
+    areas = coco.area(masks)
+    for i in sorted(range(len(masks)), key=lambda i: (areas[i], segments[i].object_id), reverse=True):
+        ids[coco.decode(masks[i]).astype(bool)] = segments[i].object_id
+    return ids
+
+
+def frame_order(names: Sequence[str]) -> list[str]:
+    """Names of photos in the order in which SAM 2 reads them: by value if all are numbers, else by letters."""
+    return sorted(names, key=int if all(map(_is_number, names)) else str)
+
+
+def _coco(content: dict, path: Path, frames: Sequence[str], id_field: str | None) -> dict[str, Segments]:
+    found: dict[str, Segments] = {}
+    view_of: dict[Any, tuple[str, dict]] = {}
+    for image in _list(content, "images", path):
+        number, file = _dict(image).get("id"), _dict(image).get("file_name")
+        if number is None or not isinstance(file, str):
+            raise InputError(f"{path}: an entry of images has no id or no file_name; export the file again.")
+        view = _view_called(file, frames)
+        if view is not None:
+            view_of[number], found[view] = (view, image), []
+    by_image: dict[Any, list] = {}
+    for annotation in _list(content, "annotations", path):
+        by_image.setdefault(_dict(annotation).get("image_id"), []).append(annotation)
+    for number, (view, image) in view_of.items():
+        found[view] += _annotated(by_image.get(number, []), path, image, id_field)
+    return found
+
+
+def _view_called(file: str, frames: Sequence[str]) -> str | None:
+    """The view of this photo; folders before it may differ where the name is enough."""
+    name = PurePath(file).with_suffix("").as_posix()
+    return next((view for view in (name, PurePath(name).name) if view in frames), None)
+
+
+def _annotated(annotations: list, path: Path, picture: dict, id_field: str | None) -> Iterator[Segment]:
+    size = (picture["height"], picture["width"]) if {"height", "width"} <= picture.keys() else None
+    for position, annotation in enumerate(annotations):
+        where = f"{path}: annotation {_dict(annotation).get('id', position)}"
+        if "segmentation" not in _dict(annotation):
+            raise InputError(f"{where}: has no 'segmentation'; give COCO's annotations with run lengths or polygons.")
+        yield Segment(_id_of(annotation, position, id_field, where), annotation["segmentation"], size, where)
+
+
+def _id_of(annotation: dict, position: int, id_field: str | None, where: str) -> int:
+    fields = annotation | _dict(annotation.get("attributes"))
+    names = (id_field,) if id_field else (*_OBJECT_FIELDS, "id")
+    name = next((name for name in names if fields.get(name) is not None), None)
+    if name is None and id_field:
+        raise InputError(f"{where}: has no field {id_field!r}; choose a field that every annotation has.")
+    return position + 1 if name is None else _whole(fields[name], f"{where}: {name}")
+
+
+def _tracked(objects: dict, where: str) -> Iterator[Segment]:
+    for number, shape in objects.items():
+        if shape is not None:
+            yield Segment(_whole(number, f"{where}: object"), shape, None, f"{where}: object {number}")
+
+
+def _sa_v(content: dict, path: Path, frames: Sequence[str]) -> dict[str, Segments]:
+    masklets = _list(content, "masklet", path)
+    numbers = content.get("masklet_id", list(range(len(masklets[0]) if masklets else 0)))
+    if len(masklets) > len(frames):
+        raise InputError(
+            f"{path}: masklet has {len(masklets)} frames, there are {len(frames)} views; give a photo each."
+        )
+    found = {}
+    for frame, (view, masks) in enumerate(zip(frames, masklets)):
+        if not isinstance(masks, list) or len(masks) != len(numbers):
+            raise InputError(f"{path}: masklet[{frame}] has not one mask for each masklet_id; export the file again.")
+        # masklets are numbered from 0, which is the background here
+        found[view] = list(_tracked({1 + int(k): mask for k, mask in zip(numbers, masks)}, f"{path}: frame {frame}"))
+    return found
+
+
+def _views_of(keys: list[str], frames: Sequence[str], path: Path) -> dict[str, str]:
+    """The view of each key, which is a name or counts the frames from 0."""
+    named = {key: key for key in keys if key in frames}
+    counted = {key: frames[int(key)] for key in keys if _is_number(key) and int(key) < len(frames)}
+    if len(named) == len(counted) == len(keys) and named != counted:
+        raise InputError(
+            f"{path}: frame {keys[0]!r} may be a view's name or its number, counted from 0; rename the photos or keys."
+        )
+    whole = named if len(named) == len(keys) else counted
+    for key in keys:
+        if key not in whole:
+            raise InputError(
+                f"{path}: frame {key!r} is no view: neither a name nor a number from 0 to {len(frames) - 1};"
+                " key the tracks by the number of the photo in sorted order."
+            )
+    return whole
+
+
+def _encoded(coco: Any, segment: Segment, size: tuple[int, int]) -> dict[str, Any]:
+    """Compressed run lengths of a segment, known to be sound: pycocotools reads beyond the end of damaged ones."""
+    shape, where = segment.shape, segment.where
+    if isinstance(shape, dict):
+        height, width = _size(shape.get("size"), where)
+        counts = shape.get("counts")
+        try:
+            runs = _run_lengths(counts) if isinstance(counts, str) else np.array(counts, np.int64, ndmin=1)
+            sound = runs.ndim == 1 and runs.min() >= 0 and runs.sum() == height * width
+        except (ValueError, TypeError, OverflowError):
+            sound = False
+        if not sound:
+            raise InputError(f"{where}: run lengths do not fill {height}x{width} pixels; export the mask again.")
+        if isinstance(counts, str):
+            return {"size": [height, width], "counts": counts.encode("ascii")}
+        return coco.frPyObjects({"size": [height, width], "counts": runs.tolist()}, height, width)
+    height, width = _size(segment.size or size, where)
+    try:
+        polygons = [np.array(polygon, float) for polygon in shape]
+        sound = len(polygons) > 0 and all(p.ndim == 1 and p.size >= 6 and p.size % 2 == 0 for p in polygons)
+        sound = sound and all(np.max(np.abs(polygon)) <= _LONGEST for polygon in polygons)  # false for NaN
+    except (ValueError, TypeError):
+        sound = False
+    if not sound:
+        raise InputError(
+            f"{where}: segmentation is neither {{size, counts}} nor a list of polygons [x, y, x, y, x, y, ...];"
+            " export the mask again."
+        )
+    return coco.merge(coco.frPyObjects([polygon.tolist() for polygon in polygons], height, width))
+
+
+def _run_lengths(counts: str) -> Int[np.ndarray, "runs"]:
+    """Lengths of the runs in COCO's compression: groups of 5 bits, from the third run on the change since two before.
+
+    Raises:
+        ValueError: a character that does not belong here, or the last number is cut off.
+    """
+    groups = np.frombuffer(counts.encode("ascii"), np.uint8).astype(np.int64) - 48
+    if not len(groups) or groups.min() < 0 or groups.max() > 63 or groups[-1] & 32:
+        raise ValueError
+    starts = np.append(0, np.flatnonzero(groups[:-1] & 32 == 0) + 1)
+    lengths = np.diff(np.append(starts, len(groups)))
+    if lengths.max() > 7:
+        raise ValueError
+    place = np.arange(len(groups)) - np.repeat(starts, lengths)
+    runs = np.add.reduceat((groups & 31) << (5 * place), starts)
+    negative = groups[starts + lengths - 1] & 16 != 0
+    runs -= np.where(negative, 1 << (5 * lengths), 0)
+    runs[1::2] = np.cumsum(runs[1::2])
+    runs[2::2] = np.cumsum(runs[2::2])
+    return runs
+
+
+def _size(size: Any, where: str) -> tuple[int, int]:
+    if isinstance(size, list | tuple) and len(size) == 2:
+        height, width = (_whole(extent, f"{where}: size") for extent in size)
+        if 0 < height <= _LONGEST and 0 < width <= _LONGEST:
+            return height, width
+    raise InputError(f"{where}: size is {size}; it must be [height, width] in pixels.")
+
+
+def _whole(value: Any, where: str) -> int:
+    try:
+        number = int(value)
+        if number == float(value):
+            return number
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise InputError(f"{where} is {value!r}; it must be a whole number.")
+
+
+def _is_number(key: Any) -> bool:
+    return isinstance(key, str) and key.isascii() and key.isdigit()
+
+
+def _list(content: Mapping, name: str, path: Path) -> list:
+    if not isinstance(content[name], list):
+        raise InputError(f"{path}: '{name}' is no list; export the file again.")
+    return content[name]
+
+
+def _dict(value: Any) -> dict:
+    return value if isinstance(value, dict) else {}
+
+
+def _pycocotools(where: str) -> Any:
+    try:
+        from pycocotools import mask
+    except ImportError:
+        raise InputError(f"{where}: masks in JSON need pycocotools: pip install 'pigjax[formats]'.") from None
+    return mask

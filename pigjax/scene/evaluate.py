@@ -1,0 +1,177 @@
+"""What `pigjax evaluate` does and leaves: a data set and a scene in, scores and a sheet of masks out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+from zipfile import BadZipFile
+
+import jax.numpy as jnp
+import numpy as np
+
+from pigjax import io
+from pigjax.errors import InputError
+from pigjax.evaluation import Evaluation, evaluate_labels, ground_prompts, pixel_ids, reference_view
+from pigjax.io.files import existing
+from pigjax.metrics import mean_iou
+from pigjax.overlay import comparison_sheet
+from pigjax.segmentation import Labels, fill_unseen, lift_masks
+from pigjax.splat import Gaussians
+
+_MOST_ROWS = 24
+_MOST_IDS = 65536  # votes are counted per Gaussian and id
+
+
+class Report(NamedTuple):
+    """What was scored, and how prompts found their objects."""
+
+    evaluation: Evaluation
+    grounding: str
+    black: tuple[str, ...]
+    views: dict[str, int]  # test views of each prompt
+
+
+def evaluate_files(
+    gaussians: Gaussians,
+    dataset: io.Dataset,
+    out: Path,
+    *,
+    labels: Path | None = None,
+    prompts: Path | None = None,
+    reference: str | None = None,
+    tau_T: float = 0.5,
+    tau_d: float = 0.03,
+    fill: bool = True,
+    progress: Callable[[str, int, int], None] = lambda stage, done, of: None,
+) -> Report:
+    """Score labelled Gaussians on a data set; writes `scores.json` and `sheet.png` into `out`. Host.
+
+    Args:
+        gaussians: the scene.
+        dataset: as `io.load_dataset` reads it.
+        out: folder of the results.
+        labels: `labels.npz` as `pigjax segment` writes it; if not given, the masks of the data set are lifted.
+        prompts: JSON {prompt: id}. Else the data set's names give the ids, and where it has none each prompt takes the
+            object that overlaps its truth best in the reference view.
+        reference: name of that view, which also overrules the data set's names; if not given, the view with most
+            prompts.
+        tau_T: see `lift_masks`.
+        tau_d: see `lift_masks`.
+        fill: give Gaussians that no view saw the id of their neighbours.
+        progress: called with the stage, steps done and of all.
+
+    Raises:
+        InputError: files that do not fit each other, or cannot be written.
+    """
+    progress("lift", 0, 1)
+    lifted = _read_labels(labels, len(gaussians)) if labels else _lift(gaussians, dataset, tau_T, tau_d)
+    lifted = fill_unseen(gaussians, lifted) if fill else lifted
+    progress("lift", 1, 1)
+    cameras = {view: dataset.test.cameras[i] for i, view in enumerate(dataset.test.names)}
+    objects, grounding = _grounding(gaussians, lifted, dataset, cameras, prompts, reference)
+    evaluation = evaluate_labels(
+        gaussians, lifted, cameras, dataset.truths, objects,
+        progress=lambda done, of: progress("draw", done, of),
+    )  # fmt: skip
+    views = {prompt: sum(at == prompt for _, at in dataset.truths) for prompt in objects}
+    report = Report(evaluation, grounding, dataset.black, views)
+    io.write_json(out / "scores.json", _as_json(report) | {"tau_T": tau_T, "tau_d": tau_d, "filled": fill})
+    io.write_image(out / "sheet.png", comparison_sheet(_rows(dataset, evaluation)))
+    return report
+
+
+def _lift(gaussians: Gaussians, dataset: io.Dataset, tau_T: float, tau_d: float) -> Labels:
+    if dataset.masks is None or dataset.cameras is None:
+        raise InputError("the data set was read without masks that vote; give labels.npz, or read it with vote=True.")
+    num_ids = int(dataset.masks.max()) + 1
+    if num_ids > _MOST_IDS:
+        raise InputError(
+            f"masks hold the id {num_ids - 1}, which numbers annotations rather than objects; give the objects ids"
+            f" below {_MOST_IDS} that are the same in all views."
+        )
+    return lift_masks(gaussians, dataset.cameras, dataset.masks, num_ids=num_ids, tau_T=tau_T, tau_d=tau_d)
+
+
+def _read_labels(path: Path, count: int) -> Labels:
+    try:
+        with np.load(existing(path, "file of labels"), allow_pickle=False) as archive:
+            labels = Labels(*(jnp.asarray(archive[name]) for name in ("object_id", "votes", "confidence")))
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"{path}: not the labels.npz of 'pigjax segment' ({error}); segment the scene again."
+        ) from None
+    if labels.object_id.shape != (count,):
+        raise InputError(f"{path}: labels {len(labels.object_id)} Gaussians, the scene has {count}; segment it again.")
+    return labels
+
+
+def _grounding(
+    gaussians: Gaussians,
+    labels: Labels,
+    dataset: io.Dataset,
+    cameras: dict[str, Any],
+    prompts: Path | None,
+    reference: str | None,
+) -> tuple[dict[str, int | None], str]:
+    """Id of each prompt, and in words how it was found."""
+    wanted = list(dict.fromkeys(prompt for _, prompt in dataset.truths))
+    if prompts is not None:
+        given = _read_prompts(prompts)
+        return {prompt: given.get(prompt) for prompt in wanted}, f"ids given in {prompts.name}"
+    if dataset.names and reference is None:
+        named = {name: number for number, name in dataset.names.items()}
+        return {prompt: named.get(prompt) for prompt in wanted}, "ids named in names.json"
+    view = reference_view(dataset.truths) if reference is None else reference
+    if view not in cameras:
+        raise InputError(f"reference = {view!r}: no view with truth; choose among {', '.join(cameras)}.")
+    ids, _ = pixel_ids(gaussians, labels, cameras[view])
+    truths = {prompt: mask for (at, prompt), mask in dataset.truths.items() if at == view}
+    found = ground_prompts(ids, truths)
+    return {prompt: found.get(prompt) for prompt in wanted}, f"best overlap with the truth in view {view}"
+
+
+def _read_prompts(path: Path) -> dict[str, int]:
+    content = io.read_json(path)
+    sound = isinstance(content, dict) and all(type(number) is int and number > 0 for number in content.values())
+    if not sound:
+        raise InputError(f'{path}: is not {{prompt: id}} with ids > 0; write for example {{"green apple": 3}}.')
+    return content
+
+
+def _as_json(report: Report) -> dict[str, Any]:
+    evaluation = report.evaluation
+    levels = {
+        level: {
+            "mean_iou": scores.mean_iou,
+            "mean_boundary_iou": scores.mean_boundary_iou,
+            "missing": scores.missing,
+            "prompts": {
+                prompt: {"iou": iou, "boundary_iou": boundary} for prompt, (iou, boundary) in scores.per_prompt.items()
+            },
+        }
+        for level, scores in evaluation.scores.items()
+    }
+    return {
+        "levels": levels,
+        "objects": evaluation.objects,
+        "views": report.views,
+        "grounding": report.grounding,
+        "black": report.black,
+    }
+
+
+def _rows(dataset: io.Dataset, evaluation: Evaluation) -> Iterable[tuple[str, Any, Any, Any]]:
+    """Rows of the sheet, what is visible of the object: at most 24, spread over all views and prompts."""
+    keys = list(dataset.truths)
+    chosen = np.unique(np.linspace(0, len(keys) - 1, _MOST_ROWS).astype(int))
+    images = dict(zip(dataset.test.names, dataset.test.images))
+    for view, prompt in (keys[i] for i in chosen):
+        truth = dataset.truths[view, prompt]
+        mask = evaluation.masks["visible"].get((view, prompt))
+        title = f"{view}  {prompt}  " + (
+            "missing" if mask is None else f"IoU {100 * float(mean_iou(mask, truth)):.1f} %"
+        )
+        yield title, images[view], truth, np.zeros_like(truth) if mask is None else mask
