@@ -64,7 +64,7 @@ def lift_masks(
         gaussians: the scene.
         cameras: batch of posed views.
         masks: id of every pixel in every view, 0 = background, the same id for the same object in all views.
-        num_ids: ids run from 0 to num_ids - 1.
+        num_ids: ids run from 0 to num_ids - 1; votes take [n num_ids], so number ids far apart anew (`compact_ids`).
         tau_T: transmittance below which the surface lies, in [0, 1].
         tau_d: depth tolerance relative to the surface depth, in [0, 1].
         temperature: None for the hard vote; a positive number makes both tests sigmoids of that width (in units of
@@ -146,22 +146,24 @@ def object_mask(
 def fill_unseen(gaussians: Gaussians | Splats, labels: Labels, k: int = 8) -> Labels:
     """Give Gaussians that no view saw (id -1) the commonest id among their k nearest seen ones, host.
 
-    The nearest neighbour decides ties. The confidence of a filled Gaussian is its neighbours' agreement.
+    The nearest neighbour decides ties. The confidence of a filled Gaussian is its neighbours' agreement. A Gaussian
+    whose mean is not finite is nobody's neighbour, and stays as it was.
 
     Raises:
         InputError: no Gaussian was seen, or k < 1.
     """
     ids, means = np.array(labels.object_id), np.asarray(gaussians.means)
-    unseen = ids < 0
+    placed = np.isfinite(means).all(1)
+    seen, unseen = placed & (ids >= 0), placed & (ids < 0)
     if k < 1:
         raise InputError(f"k = {k}: at least one neighbour is needed.")
-    if unseen.all():
+    if not seen.any():
         raise InputError("labels.object_id holds no seen Gaussian (all are -1): no neighbour can lend its id.")
     if not unseen.any():
         return labels
-    k = min(k, int((~unseen).sum()))
-    _, nearest = cKDTree(means[~unseen]).query(means[unseen], k=range(1, k + 1))
-    neighbours = ids[~unseen][nearest]
+    k = min(k, int(seen.sum()))
+    _, nearest = cKDTree(means[seen]).query(means[unseen], k=range(1, k + 1))
+    neighbours = ids[seen][nearest]
     agreement = np.sum(neighbours[:, :, None] == neighbours[:, None, :], 2)
     # argmax takes the first of equals, and neighbours come nearest first
     best = np.argmax(agreement, 1)
@@ -327,4 +329,6 @@ def _check_ids(masks, num_ids: int) -> None:
         raise InputError(f"num_ids = {num_ids}: at least 2 are needed, the background and one object.")
     high = int(np.max(masks)) if is_known(masks) else 0
     if high >= num_ids:
-        raise InputError(f"masks hold the id {high}, num_ids = {num_ids}: raise num_ids to {high + 1} or relabel.")
+        raise InputError(
+            f"masks hold the id {high}, num_ids = {num_ids}: raise num_ids to {high + 1}, or relabel (compact_ids)."
+        )
