@@ -5,6 +5,7 @@ The way of the data: files (`io`) → Gaussians (`reconstruct`, `splat`) → obj
 one file.
 """
 
+from pigjax.association import Association, associate_masks, compact_ids
 from pigjax.camera import Camera, interpolate_path, look_at, orbit, stack_cameras
 from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
@@ -39,6 +40,7 @@ __version__ = "0.1.0"
 
 
 __all__ = [
+    "Association",
     "BodyContact",
     "Box",
     "Camera",
@@ -68,12 +70,14 @@ __all__ = [
     "Splats",
     "Trajectory",
     "Views",
+    "associate_masks",
     "at_frame",
     "bind",
     "boundary_iou",
     "choose_integrator",
     "choose_substeps",
     "collider_from_gaussians",
+    "compact_ids",
     "contributions",
     "deform",
     "eigen_clamp",

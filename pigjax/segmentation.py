@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -14,13 +14,13 @@ from jaxtyping import Array, Float, Int, Integer, Num
 from scipy.spatial import cKDTree
 
 from pigjax.arrays import array_field
-from pigjax.camera import Camera, project
+from pigjax.camera import Camera
 from pigjax.chunks import static_capacity
 from pigjax.errors import InputError
-from pigjax.splat import Gaussians, RenderConfig, Splats, as_splats, blend_config, pairs_of, render, required_capacity
+from pigjax.sightings import Scalar, check_masks, draw, front_of, is_known, pixel_under
+from pigjax.splat import Gaussians, RenderConfig, Splats, as_splats, blend_config, pairs_of, required_capacity
 from pigjax.tile_walks import credits_of_candidates, soft_surface_depth
 
-Scalar = Float[Array, ""] | float
 _TIED_IDS = 4  # of more ids with equal votes, the lowest four compete
 _IDS_TOGETHER = 32  # ids credited in one pass of weighting = "alpha", which bounds its memory
 
@@ -64,7 +64,7 @@ def lift_masks(
         gaussians: the scene.
         cameras: batch of posed views.
         masks: id of every pixel in every view, 0 = background, the same id for the same object in all views.
-        num_ids: ids run from 0 to num_ids - 1.
+        num_ids: ids run from 0 to num_ids - 1; votes take [n num_ids], so number ids far apart anew (`compact_ids`).
         tau_T: transmittance below which the surface lies, in [0, 1].
         tau_d: depth tolerance relative to the surface depth, in [0, 1].
         temperature: None for the hard vote; a positive number makes both tests sigmoids of that width (in units of
@@ -83,17 +83,18 @@ def lift_masks(
     Raises:
         InputError: no views, masks that do not fit the cameras, ids or thresholds out of range, unknown options.
     """
-    _check_masks(cameras, masks, num_ids)
+    check_masks(cameras, masks)
+    _check_ids(masks, num_ids)
     _check_choice("background", background, ("ignore", "vote"))
     _check_choice("weighting", weighting, ("centre", "alpha"))
     _check_choice("ties", ties, ("alpha", "lowest"))
     for name, value in (("tau_T", tau_T), ("tau_d", tau_d), ("purity", purity)):
-        if _is_known(value) and not 0 <= float(value) <= 1:
+        if is_known(value) and not 0 <= float(value) <= 1:
             raise InputError(f"{name} = {float(value):g}: it must lie in [0, 1].")
     if temperature is not None:
         if weighting == "alpha":
             raise InputError("temperature has no thresholds to soften with weighting = 'alpha': leave it None.")
-        if _is_known(temperature) and not float(temperature) > 0:
+        if is_known(temperature) and not float(temperature) > 0:
             raise InputError(f"temperature = {float(temperature):g}: it must be > 0, or None for the hard vote.")
     dtype = gaussians.means.dtype
     temperature = None if temperature is None else jnp.asarray(temperature, dtype)
@@ -138,29 +139,31 @@ def object_mask(
     member = (labels.object_id == object_id).astype(splats.opacities.dtype)
     if mode == "isolated":
         alone = dataclasses.replace(splats, opacities=splats.opacities * member)
-        return _draw("alpha", alone, camera, config)[0]
-    return _draw("object_weights", splats, camera, config, object_weights=member[:, None])[0][..., 0]
+        return draw("alpha", alone, camera, config)[0]
+    return draw("object_weights", splats, camera, config, object_weights=member[:, None])[0][..., 0]
 
 
 def fill_unseen(gaussians: Gaussians | Splats, labels: Labels, k: int = 8) -> Labels:
     """Give Gaussians that no view saw (id -1) the commonest id among their k nearest seen ones, host.
 
-    The nearest neighbour decides ties. The confidence of a filled Gaussian is its neighbours' agreement.
+    The nearest neighbour decides ties. The confidence of a filled Gaussian is its neighbours' agreement. A Gaussian
+    whose mean is not finite is nobody's neighbour, and stays as it was.
 
     Raises:
         InputError: no Gaussian was seen, or k < 1.
     """
     ids, means = np.array(labels.object_id), np.asarray(gaussians.means)
-    unseen = ids < 0
+    placed = np.isfinite(means).all(1)
+    seen, unseen = placed & (ids >= 0), placed & (ids < 0)
     if k < 1:
         raise InputError(f"k = {k}: at least one neighbour is needed.")
-    if unseen.all():
+    if not seen.any():
         raise InputError("labels.object_id holds no seen Gaussian (all are -1): no neighbour can lend its id.")
     if not unseen.any():
         return labels
-    k = min(k, int((~unseen).sum()))
-    _, nearest = cKDTree(means[~unseen]).query(means[unseen], k=range(1, k + 1))
-    neighbours = ids[~unseen][nearest]
+    k = min(k, int(seen.sum()))
+    _, nearest = cKDTree(means[seen]).query(means[unseen], k=range(1, k + 1))
+    neighbours = ids[seen][nearest]
     agreement = np.sum(neighbours[:, :, None] == neighbours[:, None, :], 2)
     # argmax takes the first of equals, and neighbours come nearest first
     best = np.argmax(agreement, 1)
@@ -176,7 +179,7 @@ def enough_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: Rend
 
     Left alone where the capacity was set by the caller or where inputs are traced, since shapes are static there.
     """
-    if config.capacity is not None or not all(map(_is_known, jax.tree.leaves((gaussians, cameras)))):
+    if config.capacity is not None or not all(map(is_known, jax.tree.leaves((gaussians, cameras)))):
         return config
     with jax.ensure_compile_time_eval():
         needed = required_capacity(gaussians, cameras, config)
@@ -198,7 +201,7 @@ def _collect(splats, cameras, masks, thresholds, num_ids, weighting, config):
         dtype = np.min_scalar_type(len(cameras))
 
         def count(votes, camera, mask):
-            pixel, seen, overflow = _hard_votes(splats, camera, tau_T, tau_d, config)
+            pixel, seen, overflow = front_of(splats, camera, tau_T, tau_d, config)
             return _cast(votes, mask.ravel()[pixel], seen), overflow
 
     else:
@@ -228,32 +231,13 @@ def _left_out(splats: Splats, cameras: Camera, config: RenderConfig):
     return jnp.sum(lax.map(of_view, cameras), dtype=jnp.int32)
 
 
-def _hard_votes(splats: Splats, camera: Camera, tau_T, tau_d, config: RenderConfig):
-    """The pixel under each centre, whether the centre lies on the surface there, and the pairs dropped."""
-    reverse = dataclasses.replace(config, differentiation="reverse")  # nothing to differentiate, and never short
-    depth, overflow = _draw("surface_depth", splats, camera, reverse, tau_T=tau_T)
-    pixel, z, inside = _pixel_under(splats, camera, config)
-    depth = depth.ravel()[pixel]
-    # where there is no surface the depth is NaN, and no comparison holds
-    return pixel, inside & (jnp.abs(z - depth) <= depth * tau_d), overflow
-
-
 def _soft_votes(splats: Splats, camera: Camera, tau_T, tau_d, temperature, config: RenderConfig):
-    """As `_hard_votes`, with a weight between 0 and 1 in place of yes and no."""
+    """As `front_of`, with a weight between 0 and 1 in place of yes and no."""
     depth, presence, overflow = soft_surface_depth(splats, camera, config, tau_T=tau_T, temperature=temperature)
-    pixel, z, inside = _pixel_under(splats, camera, config)
+    pixel, z, inside = pixel_under(splats, camera, config)
     depth = depth.ravel()[pixel]
     close = jax.nn.sigmoid((tau_d - jnp.abs(z - depth) / depth) / temperature)
     return pixel, jnp.where(inside, presence.ravel()[pixel] * close, 0.0), overflow
-
-
-def _pixel_under(splats: Splats, camera: Camera, config: RenderConfig):
-    """Flat index of the pixel that each centre falls in, the centre's camera z [m], and whether it is in view."""
-    position, z = project(splats.means, camera)
-    size = jnp.array([camera.width, camera.height], position.dtype)
-    inside = (z > config.near) & jnp.all((position >= 0) & (position < size), 1)
-    column, row = jnp.where(inside[:, None], position, 0.0).astype(jnp.int32).T
-    return row * camera.width + column, z, inside
 
 
 def _cast(votes, ids, weight):
@@ -278,24 +262,17 @@ def _credits(splats: Splats, camera: Camera, mask, num_ids: int, config: RenderC
     together = min(num_ids, _IDS_TOGETHER)
 
     def of_ids(first):
-        def draw(weights):
-            return _draw("object_weights", splats, camera, reverse, object_weights=weights)
+        def blend(weights):
+            return draw("object_weights", splats, camera, reverse, object_weights=weights)
 
         weights = jnp.zeros((len(splats), together), splats.means.dtype)
-        _, transpose, overflow = jax.vjp(draw, weights, has_aux=True)
+        _, transpose, overflow = jax.vjp(blend, weights, has_aux=True)
         return transpose(jax.nn.one_hot(mask - first, together, dtype=weights.dtype))[0], overflow
 
     if together == num_ids:
         return of_ids(0)
     credits, overflow = lax.map(of_ids, jnp.arange(0, num_ids, together, dtype=jnp.int32))
     return credits.transpose(1, 0, 2).reshape(len(splats), -1)[:, :num_ids], overflow[0]
-
-
-@eqx.filter_jit
-def _draw(output: str, splats: Splats, camera: Camera, config: RenderConfig, **options) -> tuple[Array, Array]:
-    """One output of the renderer, and the pairs that it dropped."""
-    frame: Any = render(splats, camera, config, outputs=(output,), **options)
-    return getattr(frame, output), frame.overflow
 
 
 @eqx.filter_jit
@@ -342,28 +319,16 @@ def _settle(votes, most, winner, background: str, break_ties):
     return jnp.where(tied, jnp.take_along_axis(candidates, best[:, None], 1)[:, 0], winner)
 
 
-def _is_known(value) -> bool:
-    return not isinstance(value, jax.core.Tracer)
-
-
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise InputError(f"{name} = {value!r}: choose from {', '.join(choices)}.")
 
 
-def _check_masks(cameras: Camera, masks, num_ids: int) -> None:
-    if cameras.world_to_cam.ndim != 3 or len(cameras) == 0:
-        raise InputError("cameras hold no views: pass a batch of at least one camera (see camera.stack_cameras).")
+def _check_ids(masks, num_ids: int) -> None:
     if num_ids < 2:
         raise InputError(f"num_ids = {num_ids}: at least 2 are needed, the background and one object.")
-    expected = len(cameras), cameras.height, cameras.width
-    if masks.shape != expected:
-        raise InputError(f"masks have shape {masks.shape}, the cameras ask for {expected} (views, height, width).")
-    if not jnp.issubdtype(masks.dtype, jnp.integer):
-        raise InputError(f"masks have type {masks.dtype}: integer ids are needed.")
-    if _is_known(masks):
-        low, high = int(np.min(masks)), int(np.max(masks))
-        if low < 0:
-            raise InputError(f"masks hold the id {low}: ids start at 0, the background.")
-        if high >= num_ids:
-            raise InputError(f"masks hold the id {high}, num_ids = {num_ids}: raise num_ids to {high + 1} or relabel.")
+    high = int(np.max(masks)) if is_known(masks) else 0
+    if high >= num_ids:
+        raise InputError(
+            f"masks hold the id {high}, num_ids = {num_ids}: raise num_ids to {high + 1}, or relabel (compact_ids)."
+        )

@@ -17,13 +17,13 @@ FLOORS = [
     {"chunks"},
     {"tiles", "colliders", "transfers", "contact"},
     {"splat", "matter", "passes"},
-    {"tile_walks", "clamp", "shells", "relocation", "starts", "overlay", "substep", "io"},
+    {"tile_walks", "clamp", "shells", "relocation", "starts", "overlay", "substep", "io", "sightings"},
     {"filling", "implicit"},
     {"frames"},
     {"boxes"},
     {"mls_mpm"},
     {"segmentation", "particles", "solids", "reconstruct", "pruning"},
-    {"editing", "evaluation"},
+    {"association", "editing", "evaluation"},
     {"scene"},
     {"cli"},
     {"__main__"},
@@ -31,6 +31,7 @@ FLOORS = [
 FLOOR_OF = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
 # the two worlds meet in particles.py and solids.py only
 SPLATS = {"splat", "lists", "footprints", "chunks", "bands", "tiles", "tile_walks", "clamp", "segmentation"}
+SPLATS |= {"sightings", "association"}
 SPLATS |= {"starts", "relocation", "reconstruct", "filling", "shells", "pruning", "editing", "evaluation"}
 MATTER = {
     "matter",
