@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -55,7 +55,7 @@ class Sleeper(Fit):
     """Frames of one simulation in which bodies sleep: who does, and since when the others are at rest."""
 
     settings: Sleep
-    body: Int[np.ndarray, "p"]  # of each particle
+    body: Int[np.ndarray, "p"]  # of each particle; as made: any numbers, then from 0
     frames: int = field(default=0, init=False)  # done
     still: Int[np.ndarray, "b"] = field(init=False)  # frames that each body has been at rest
     asleep: Bool[np.ndarray, "b"] = field(init=False)
@@ -63,6 +63,7 @@ class Sleeper(Fit):
     def __post_init__(self):
         numbers, self.body = np.unique(np.asarray(self.body), return_inverse=True)
         self.still, self.asleep = np.zeros(len(numbers), int), np.zeros(len(numbers), bool)
+        self._bodies = _Bodies.of(self.body)
 
     def frame(
         self, particles: Particles, domain: Grid, table: Any, config: SimConfig, devices: int, **step: Any
@@ -72,7 +73,7 @@ class Sleeper(Fit):
         Raises:
             SimulationError: as `Fit.frame`.
         """
-        before, around = particles, _Around.of(particles, self.body, len(self.still), domain, config, step)
+        before, around = particles, _Around.of(particles, self._bodies, domain, config, step)
         awake = self._awake(around, step)
         falling = ~awake & ~self.asleep
         if falling.any():
@@ -81,7 +82,7 @@ class Sleeper(Fit):
             before = eqx.tree_at(lambda p: (p.v, p.C), particles, at_rest)
         while True:
             moved, path, health = self._simulate(before, awake, domain, table, config, devices, step)
-            touched = around.near(awake, *_boxes(np.asarray(moved.x, np.float64), self.body, len(awake)), 0.0)
+            touched = around.near(awake, *self._bodies.boxes(np.asarray(moved.x, np.float64)), 0.0)
             if not touched.any():
                 break
             awake = awake | touched
@@ -132,8 +133,7 @@ class Sleeper(Fit):
         duration = float(step["dt"]) * step["substeps"]
         x, v, old = (np.asarray(a, np.float64) for a in (moved.x, moved.v, before.x))
         way = np.maximum(np.linalg.norm(x - old, axis=-1), np.linalg.norm(v, axis=-1) * duration)
-        farthest = np.zeros(len(awake))
-        np.maximum.at(farthest, self.body, np.where(np.isfinite(way), way, np.inf))
+        farthest = self._bodies.most(np.where(np.isfinite(way), way, np.inf))
         slow = farthest < self.settings.speed * float(domain.dx)
         self.still = np.where(awake, np.where(slow, self.still + 1, 0), self.still)
         self.asleep = ~awake
@@ -152,6 +152,27 @@ class Sleeper(Fit):
         self.still, self.asleep = still.astype(int), asleep > 0
 
 
+class _Bodies(NamedTuple):
+    """Particles by body."""
+
+    order: Int[np.ndarray, "p"] | slice  # body after body
+    starts: Int[np.ndarray, "b"]
+
+    @classmethod
+    def of(cls, body):
+        starts = np.concatenate([[0], np.cumsum(np.bincount(body))[:-1]])
+        return cls(slice(None) if (np.diff(body) >= 0).all() else np.argsort(body, kind="stable"), starts)
+
+    def most(self, values):
+        """The largest value of each body."""
+        return np.maximum.reduceat(values[self.order], self.starts)
+
+    def boxes(self, x):
+        """Corners of the box around each body [b 3], of the particles that are finite."""
+        finite = np.isfinite(x)
+        return -self.most(np.where(finite, -x, -np.inf)), self.most(np.where(finite, x, -np.inf))
+
+
 @dataclass
 class _Around:
     """Where bodies are at a frame's beginning, how fast, and what there is for them to meet."""
@@ -167,21 +188,20 @@ class _Around:
     fall: float  # way that gravity adds in a frame [m]
 
     @classmethod
-    def of(cls, particles, body, count, domain, config, step):
+    def of(cls, particles, bodies, domain, config, step):
         x, v = (np.asarray(a, np.float64) for a in (particles.x, particles.v))
-        low, high = _boxes(x, body, count)
-        speed = np.zeros(count)
+        low, high = bodies.boxes(x)
         rate = np.linalg.norm(v, axis=-1)
-        np.maximum.at(speed, body, np.where(np.isfinite(rate), rate, 0.0))
+        speed = bodies.most(np.where(np.isfinite(rate), rate, 0.0))
         dx, duration = float(domain.dx), float(step["dt"]) * step["substeps"]
         reach = dx * len(KERNELS[config.kernel].offsets) / 2
-        met, fastest = np.zeros(count, bool), 0.0
+        met, fastest = np.zeros(len(speed), bool), 0.0
         corners = np.concatenate([low, high])
         span = np.array(np.meshgrid(*zip(corners.min(0) - reach, corners.max(0) + reach))).reshape(3, -1).T
         for collider in step["colliders"]:
             if collider.moves:
                 near, top = _met(collider, particles.x, span, float(step["start"]), duration, math.sqrt(3) * reach)
-                np.logical_or.at(met, body, near)
+                met |= bodies.most(near)
                 fastest = max(fastest, top)
         fall = float(np.linalg.norm(step["gravity"])) * duration**2 / 2
         return cls(low, high, speed, met, fastest, reach, dx, duration, fall)
@@ -202,15 +222,6 @@ def _met(collider: Collider, x, span, start, duration, reach):
     """Which particles a moving collider may touch in a frame, and its top speed among the corners `span`."""
     top = float(collider.top_speed(jnp.asarray(span, x.dtype), start + duration))
     return np.asarray(collider.distance(x, start)) < reach + top * duration, top
-
-
-def _boxes(x, body, count):
-    """Corners of the box around each body [b 3], of the particles that are finite."""
-    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-    finite = np.isfinite(x).all(-1)
-    np.minimum.at(low, body[finite], x[finite])
-    np.maximum.at(high, body[finite], x[finite])
-    return low, high
 
 
 def _put(whole, index, part):
