@@ -1,8 +1,8 @@
 """Speed, error and memory of MLS-MPM: `python benchmarks/bench_mpm.py [part ...] [--rivals PYTHON]`.
 
-Parts: speed (ours on one and all devices, rivals beside), laws, gradient, domain, features, batch, memory. Times are
-medians of warm windows, compile time apart. `--rivals` is the Python of an environment with Taichi 1.7.4 and Warp 1.19,
-`--peers` the folder of their scripts. Without parts, all are run.
+Parts: speed (ours on one and all devices, rivals beside), laws, gradient, domain, features, sleep, batch, memory. Times
+are medians of warm windows, compile time apart. `--rivals` is the Python of an environment with Taichi 1.7.4 and Warp
+1.19, `--peers` the folder of their scripts. Without parts, all are run.
 """
 
 import argparse
@@ -20,13 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from _timing import machine, use_host_devices
 
-from pigjax.boxes import whole
+from pigjax.boxes import Fit, whole
 from pigjax.colliders import Plane
 from pigjax.contact import BodyContact
 from pigjax.frames import run_frames
 from pigjax.materials import LAWS, Material, material_table
 from pigjax.matter import Grid, fit_grid, make_particles
 from pigjax.mls_mpm import SimConfig, rollout
+from pigjax.sleep import Sleep, Sleeper
 
 DT = 1e-4  # the rivals' step
 ELASTIC = {"young": 1e5, "poisson": 0.2}
@@ -194,6 +195,31 @@ def features(arguments):
         print(f"| {name} | {seconds * 1e3:.2f} | {seconds / base:.2f} |", flush=True)
 
 
+def sleep(arguments):
+    """A frame of 20 substeps of a block of 90k particles at rest and one of 10k that flies past it, one device."""
+    particles, grid, table = scene("fixed_corotated", 100_000, 64, domain=128)
+    flying = jnp.arange(100_000) >= 90_000
+    x = jnp.where(flying[:, None], (particles.x - 0.35) * 0.5 + jnp.asarray([1.0, 0.4, 0.4]), particles.x)
+    v = jnp.where(flying[:, None], jnp.asarray([0.0, 0.0, -1.0]), 0.0)
+    particles = eqx.tree_at(lambda p: (p.x, p.v, p.body), particles, (x, v, flying.astype(jnp.int32)))
+    settings, step = SimConfig(devices=1), {"frames": 1, "substeps": 20, "start": jnp.float32(0)}
+    step |= {"dt": jnp.float32(DT), "gravity": jnp.zeros(3), "colliders": (), "contact": None}
+    print("| asleep | ms per frame | against no sleep | compile s |")
+    print("|---|---|---|---|")
+    base = None
+    for name, asleep in (("sleep=None", None), ("none", (0, 0)), ("the block", (1, 0)), ("both", (1, 1))):
+        fit = Fit() if asleep is None else Sleeper(settings=Sleep(), body=np.asarray(particles.body))
+
+        def frame(fit=fit, asleep=asleep):
+            if asleep is not None:  # as it was, for each window
+                fit.asleep, fit.still = np.array(asleep, bool), 99 * np.array(asleep)
+            return fit.frame(particles, grid, table, settings, 1, **step)
+
+        first, seconds, _ = timed(frame)
+        base = base or seconds
+        print(f"| {name} | {seconds * 1e3:.1f} | {seconds / base:.2f} | {first - seconds:.1f} |", flush=True)
+
+
 def batch(arguments):
     """Simulations of 1,000 particles together by vmap, against one after another."""
     print("| simulations of 1k/24³, 20 steps | together ms | one after another ms | gain |")
@@ -236,7 +262,7 @@ def memory(arguments):
         print(f"| {count // 1000}k/{nodes}³ | {total[0]:.0f} | {total[1]:.0f} | {peak} |", flush=True)
 
 
-PARTS = {part.__name__: part for part in (speed, laws, gradient, domain, features, batch, memory)}
+PARTS = {part.__name__: part for part in (speed, laws, gradient, domain, features, sleep, batch, memory)}
 
 
 def main():

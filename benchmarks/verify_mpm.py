@@ -12,6 +12,7 @@ import matplotlib.pyplot as plt
 from _timing import machine
 from verification.bars import bars
 from verification.bodies import cantilever, plates, two_discs
+from verification.classic import classic
 from verification.flows import dam_break, sand, sand_cylinder
 from verification.kernels import kernels
 from verification.laws import laws
@@ -32,6 +33,7 @@ CASES = {
         sand,
         sand_cylinder,
         kernels,
+        classic,
     )
 }
 COMMAND = "python benchmarks/verify_mpm.py"

@@ -33,6 +33,7 @@ from pigjax.pruning import contributions, prune
 from pigjax.reconstruct import FitConfig, reconstruct
 from pigjax.scene import RunReport, Scene, load_scene, run_scene
 from pigjax.segmentation import Labels, fill_unseen, lift_masks, object_mask
+from pigjax.sleep import Sleep
 from pigjax.solids import collider_from_gaussians
 from pigjax.splat import Frame, Gaussians, RenderConfig, Splats, render, required_capacity, surface_depth
 
@@ -66,6 +67,7 @@ __all__ = [
     "SceneError",
     "SimConfig",
     "SimulationError",
+    "Sleep",
     "Sphere",
     "Splats",
     "Trajectory",

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from pigjax.errors import SimulationError
 from pigjax.frames import Box, run_frames
@@ -26,14 +27,21 @@ _PER_DEVICE = 4096  # particles that are worth a device of their own
 
 
 def run_in_boxes(
-    particles: Particles, domain: Grid, table: MaterialTable, config: SimConfig, *, frames: int, **step
+    particles: Particles,
+    domain: Grid,
+    table: MaterialTable,
+    config: SimConfig,
+    *,
+    frames: int,
+    fit: Fit | None = None,
+    **step,
 ) -> tuple[Particles, Trajectory, Health]:
-    """Simulate frame by frame, each on the box that it needs; `step` is what `run_frames` takes."""
+    """Simulate frame by frame, each as `fit` does, on the box that it needs; `step` is what `run_frames` takes."""
     devices = devices_for(config, len(particles))
-    if math.prod(domain.shape) <= _SMALL:
+    if fit is None and math.prod(domain.shape) <= _SMALL:
         box, start = whole(domain), jnp.zeros_like(step["dt"])
         return run_frames(particles, box, table, config, devices, start=start, frames=frames, **step)[:3]
-    fit = Fit()
+    fit = fit or Fit()
     duration = step["dt"] * step["substeps"]
     paths: list[Trajectory] = []
     healths: list[Health] = []
@@ -95,6 +103,15 @@ class Fit:
             if broken or not inner.any():
                 return moved, path, health
             self.slack *= 2
+
+    def memory(self) -> Float[np.ndarray, "n"]:
+        """All that the next frame needs of the past, for a checkpoint."""
+        return np.array([*self.shape, self.slack], float)
+
+    def remember(self, memory: Float[np.ndarray, "n"]) -> None:
+        """Go on from a checkpoint."""
+        nx, ny, nz, self.slack = map(float, memory)
+        self.shape = int(nx), int(ny), int(nz)
 
     def _box(self, ahead, domain):
         cells = (ahead - np.asarray(domain.origin, np.float64)) / float(domain.dx)

@@ -42,29 +42,32 @@ class BodyContact(eqx.Module):
         velocity: Float[Array, "b x y z 3"],
         mass: Float[Array, "b x y z 1"],
         volume: Float[Array, "b x y z 1"],
-        moments: Float[Array, "b x y z 4"],
+        moments: Float[Array, "b x y z 3"],
     ) -> Float[Array, "b x y z 3"]:
         """Velocities of each body's nodes [m/s] after the bodies met; momentum is kept.
 
-        `moments` are Σ w V |x|² and Σ w V x of the matter in reach of a node: how it is spread, and where [cells].
+        `moments` are Σ w V x of the matter in reach of a node: where it is [cells].
         """
         total = mass.sum(0)
         common = (mass * velocity).sum(0) / jnp.where(total > 0, total, 1.0)
         others = volume.sum(0) - volume
-        middle, spread = _spread(moments, volume)
-        middle_of_others, spread_of_others = _spread(moments.sum(0) - moments, others)
-        # Out of the body into the others, by the gradient of the flatter one, whose matter reaches farther about: edges
-        # and corners of the other do not tilt it. Opposite for two bodies, so that their impulses are too.
-        normal = safe_normalize(jnp.where(spread > spread_of_others, -_gradient(volume), _gradient(others)))
-        gap = ((middle_of_others - middle) * normal).sum(-1, keepdims=True)
-        shared = jnp.minimum(volume, others) > _SHARED * (volume + others)
+        # Out of the body into the others, which is where these grow by as much as it falls. What falls or grows of both
+        # alike is their ends side by side, and what changes of one only is its own edge: neither tilts the normal.
+        # Opposite for two bodies, so that their impulses are too.
+        growth, fall = _gradient(others) * volume, -_gradient(volume) * others
+        less = jnp.where(jnp.abs(growth) < jnp.abs(fall), growth, fall)
+        normal = safe_normalize(jnp.where((growth > 0) == (fall > 0), less, 0.0))
+        way = _middle(moments.sum(0) - moments, others) - _middle(moments, volume)
+        gap = (way * normal).sum(-1, keepdims=True)
+        aside = safe_norm(way - gap * normal)[..., None]  # far where the normal of an edge is not that of the faces
+        near = (gap < _TOUCHING) & (aside < _TOUCHING) & (jnp.minimum(volume, others) > _SHARED * (volume + others))
 
         relative = velocity - common
         approach = (relative * normal).sum(-1, keepdims=True)
         glide = relative - approach * normal
         speed = safe_norm(glide)[..., None]
         kept = jnp.maximum(1 - self.friction * approach / jnp.where(speed > 0, speed, 1.0), 0.0)
-        met = shared & (gap < _TOUCHING) & (approach > 0)
+        met = near & (approach > 0)
         parted = jnp.where(met, common + kept * glide, velocity)
         # with three bodies or more at a node, normals are not quite opposite
         missing = (mass * (velocity - parted)).sum(0)
@@ -72,10 +75,9 @@ class BodyContact(eqx.Module):
         return parted + jnp.where(met, missing / jnp.where(sharing > 0, sharing, 1.0), 0.0)
 
 
-def _spread(moments, volume):
-    """Middle [cells] and variance [cells²] of the matter in reach of each node."""
-    squares, middle = jnp.split(moments / jnp.where(volume > 0, volume, 1.0), [1], -1)
-    return middle, squares - (middle**2).sum(-1, keepdims=True)
+def _middle(moments, volume):
+    """Of the matter in reach of each node [cells]."""
+    return moments / jnp.where(volume > 0, volume, 1.0)
 
 
 def _gradient(volume):

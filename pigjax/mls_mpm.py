@@ -23,6 +23,7 @@ from pigjax.errors import InputError
 from pigjax.frames import run_frames
 from pigjax.materials import MaterialTable
 from pigjax.matter import Grid, Health, Particles, SimConfig, StepHealth, Trajectory
+from pigjax.sleep import Sleep, Sleeper
 
 __all__ = ["SimConfig", "choose_integrator", "choose_substeps", "rollout", "stable_dt", "step"]
 _COST_OF_IMPLICIT = 3000  # explicit steps in the time of an implicit one, by benchmarks/bench_implicit.py
@@ -129,16 +130,18 @@ def rollout(
     gravity: Vector,
     colliders: tuple[Collider, ...] = (),
     contact: BodyContact | None = None,
+    sleep: Sleep | None = None,
 ) -> tuple[Particles, Trajectory, Health]:
     """Simulate `frames` frames of frame_dt [s] each under gravity [m/s²].
 
     Called with known numbers it visits only the part of the grid that matter is in. Inside jit, grad and vmap the whole
     grid is held: give one that `fit_grid` has fitted. Reverse mode holds one state of the particles per block of about
-    √(frames · substeps) steps and recomputes within.
+    √(frames · substeps) steps and recomputes within. With `sleep`, bodies at rest are left out until something comes
+    near them (outside of jit, grad and vmap only, since it is decided between frames).
 
     Raises:
-        InputError: config.substeps is None inside jit, grad or vmap, or its step is above `stable_dt` (seen outside of
-            those only, and unless `config.force`).
+        InputError: config.substeps is None or `sleep` is given inside jit, grad or vmap, or the step is above
+            `stable_dt` (seen outside of those only, and unless `config.force`).
         SimulationError: matter has spread so far that its grid would not fit into memory (outside of those only).
     """
     _check_table(particles, table)
@@ -147,6 +150,10 @@ def rollout(
     substeps = config.substeps
     steps: dict[str, Any] = {"frames": frames, "frame_dt": frame_dt, "gravity": gravity, "colliders": colliders}
     if _is_traced(particles, grid, table, frame_dt, gravity, colliders, contact):
+        if sleep is not None:
+            raise InputError(
+                "rollout is traced by jit, grad or vmap, where it cannot be decided who sleeps: give sleep=None there."
+            )
         if substeps is None:
             raise InputError(
                 "rollout is traced by jit, grad or vmap and cannot choose its substeps: give SimConfig(substeps=...);"
@@ -177,6 +184,7 @@ def rollout(
         colliders=colliders,
         contact=contact,
         substeps=substeps,
+        fit=None if sleep is None else Sleeper(settings=sleep, body=np.asarray(particles.body)),
     )
 
 

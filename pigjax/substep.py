@@ -232,15 +232,15 @@ def _part_bodies(setting, scene, states, nodes, velocity):
     def moments(state):
         along = jnp.array([1, 0, 0], state.cells.dtype)[:, None]
         place = state.cells - jnp.floor(state.cells[:, :1] / width) * width * along
-        squares = (place**2).sum(1, keepdims=True)
-        rest = {"C": 0 * state.C, "stress": 0 * state.stress}
-        return state._replace(mass=state.mass * squares, v=place / squares, **rest)
+        return state._replace(v=place, C=0 * state.C, stress=0 * state.stress)
 
     moment = _to_grid(setting, scene, [moments(state) for state in states])
     apart = (scene.bodies, *scene.grid.shape, 4)
     mass = nodes.reshape(apart)[..., :1]
     specific = scene.specific_volume[:, None, None, None, None]
-    return scene.contact.part(velocity, mass / scene.unit_mass, specific * mass, specific * moment.reshape(apart))
+    return scene.contact.part(
+        velocity, mass / scene.unit_mass, specific * mass, specific * moment.reshape(apart)[..., 1:]
+    )
 
 
 def boundaries(

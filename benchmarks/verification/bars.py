@@ -25,9 +25,9 @@ def bar(cells, mode, *, law="neo_hookean", amplitude=1e-4, per_cell=4, v=None):
     shape, slope = (np.sin(wave * z), np.cos(wave * z)) if mode == "fixed" else (np.cos(wave * z), -np.sin(wave * z))
     v, C = np.zeros((len(z), 3)), np.zeros((len(z), 3, 3))
     v[:, 2], C[:, 2, 2] = amplitude * shape, amplitude * wave * slope
-    x = np.stack([np.full_like(z, 3.5 * dx), np.full_like(z, 3.5 * dx), z + foot * dx], 1)
+    x = np.stack([np.full_like(z, 4.5 * dx), np.full_like(z, 4.5 * dx), z + foot * dx], 1)
     p = particles(x, volume=dx**3 / per_cell, table=table, v=v, C=C)
-    return p, nodes(dx, 8, 8, cells + 12), table, shape
+    return p, nodes(dx, 10, 10, cells + 12), table, shape
 
 
 def period(cells, mode, kernel="quadratic"):

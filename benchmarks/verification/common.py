@@ -59,9 +59,9 @@ def lattice(lower, upper, counts):
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 
-def particles(x, *, volume, table, v=None, C=None, F=None):
+def particles(x, *, volume, table, v=None, C=None, F=None, body=0):
     """Particles with a state given where it is not rest."""
-    made = make_particles(jnp.asarray(x, float), volume=volume, table=table)
+    made = make_particles(jnp.asarray(x, float), volume=volume, table=table, body=body)
     given = {"v": v, "C": C, "F": F}
     for name, value in given.items():
         if value is not None:

@@ -25,6 +25,7 @@ from pigjax.mls_mpm import SimConfig
 from pigjax.particles import Binding, bind, seed_particles
 from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec, suggest
 from pigjax.segmentation import Labels, fill_unseen, lift_masks
+from pigjax.sleep import Sleep
 from pigjax.solids import collider_from_gaussians
 from pigjax.splat import Gaussians
 
@@ -48,6 +49,7 @@ class Plan:
     binding: Binding | None
     colliders: tuple[Collider, ...]
     contact: BodyContact | None
+    sleep: Sleep | None
     gravity: Float[np.ndarray, "3"]
     config: SimConfig
     clamp: ClampParams
@@ -163,6 +165,7 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         binding=binding if len(binding) else None,
         colliders=colliders,
         contact=_contact(spec, len(moving)),
+        sleep=None if spec.sleep is None else Sleep(speed=spec.sleep),
         gravity=vector,
         config=SimConfig(kernel=spec.kernel, cfl=spec.cfl, integrator=spec.integrator),
         clamp=ClampParams(

@@ -25,6 +25,7 @@ from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs
 from pigjax.scene.report import RunReport
 from pigjax.scene.schema import Scene
 from pigjax.segmentation import Labels
+from pigjax.sleep import Sleeper
 from pigjax.splat import Gaussians, RenderConfig, render
 
 _SHEET_FRAMES = 12
@@ -90,6 +91,7 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
         "kernel": plan.config.kernel,
         "clamp": scene.clamp.mode,
         "body_contact": plan.contact is not None,
+        "sleep": plan.sleep is not None,
         "sh_coefficients": inputs.gaussians.sh.shape[1],
     }
     report.sizes |= {
@@ -107,7 +109,8 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
     """Simulate what is not on disk yet, one rollout per frame on a grid that is fitted anew."""
     frames, particles = scene.simulation.frames, plan.particles
     done = io.last_state(folder, signature=key) if folder.exists() else None
-    checkpoint, fit = folder / "last.ckpt", Fit()
+    checkpoint = folder / "last.ckpt"
+    fit = Fit() if plan.sleep is None else Sleeper(settings=plan.sleep, body=np.asarray(particles.body))
     # the same for a run that goes on as for one from the start
     domain, near = vast_grid(scene.simulation.dx), fit_grid(particles.x, scene.simulation.dx)
     steps: dict[str, Any] = {"frames": max(frames, 1), "frame_dt": plan.frame_dt}
@@ -118,10 +121,9 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
         done = 0
         _save(folder, 0, particles, fit, key, checkpoint)
     elif done < frames:
-        saved, particles, box = io.load_pytree(checkpoint, (np.zeros((), np.int64), particles, np.zeros(4)))
+        saved, particles, memory = io.load_pytree(checkpoint, (np.zeros((), np.int64), particles, fit.memory()))
         done = int(saved)
-        nx, ny, nz, fit.slack = map(float, box)
-        fit.shape = int(nx), int(ny), int(nz)
+        fit.remember(memory)
     worst: list[Health] = []
     dtype = particles.x.dtype
     for frame in range(done + 1, frames + 1):
@@ -150,6 +152,8 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
     tell("simulate", frames, frames)
     report.modelled["integrator"] = config.integrator
     report.sizes |= {"substeps_per_frame": substeps, "last_grid": fit.shape, "resumed_from_frame": done}
+    if isinstance(fit, Sleeper):
+        report.sizes["asleep_at_the_end"] = int(fit.asleep.sum())
     if worst:
         report.health |= {
             "min_J": float(min(h.min_J for h in worst)),
@@ -167,7 +171,7 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
 def _save(folder: Path, frame: int, particles: Particles, fit: Fit, key: str, checkpoint: Path) -> None:
     arrays = {"x": particles.x, "v": particles.v, "F_visual": particles.F_visual}
     io.save_state(folder, frame, {name: np.asarray(a) for name, a in arrays.items()}, signature=key)
-    io.save_pytree(checkpoint, (np.asarray(frame), particles, np.array([*fit.shape, fit.slack], float)))
+    io.save_pytree(checkpoint, (np.asarray(frame), particles, fit.memory()))
 
 
 def _draw(

@@ -55,6 +55,7 @@ class SimulationSpec(Struct, forbid_unknown_fields=True, frozen=True):
     kernel: str = "quadratic"
     integrator: Literal["explicit", "implicit", "auto"] = "explicit"
     contact_friction: float | None = None  # of objects on each other, which then never fuse; None: one common field
+    sleep: float | None = None  # objects slower than this are left out until touched [cells/frame]; None: never
     seed: int = 0
 
 
@@ -281,6 +282,8 @@ def _check(scene: Scene, where: str) -> None:
         "camera.height": scene.camera.height,
         "camera.field_of_view": scene.camera.field_of_view,
     }
+    if scene.simulation.sleep is not None:
+        positive["simulation.sleep"] = scene.simulation.sleep
     for name, value in positive.items():
         if not 0 < value < float("inf"):
             raise SceneError(f"{where}: {name} = {value}: it must be > 0.")

@@ -1,0 +1,178 @@
+"""A scene traces what it has and nothing else: programs are compared as they are traced, before any compilation."""
+
+import re
+from collections import Counter
+from dataclasses import fields
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pigjax.colliders import Plane
+from pigjax.contact import BodyContact
+from pigjax.materials import LAWS, Material, Parameters, material_table, respond
+from pigjax.matter import Grid, group_by_law, make_particles
+from pigjax.mls_mpm import SimConfig, rollout
+
+DX = 1 / 8
+DOMAIN = Grid(jnp.zeros(3), jnp.asarray(DX), (10, 11, 12))
+ELASTIC = {"density": 1000.0, "young": 2e4, "poisson": 0.3}
+NUMBERS = {  # in the order of LAWS, what each law reads
+    "fixed_corotated": set(),
+    "neo_hookean": set(),
+    "stvk_hencky": set(),
+    "fibres": {"fibre_stiffness", "fibre_azimuth", "fibre_elevation"},
+    "von_mises": {"yield_stress", "hardening_modulus", "residual_stress"},
+    "plasticine": {"yield_stress", "hardening_modulus", "residual_stress"},
+    "drucker_prager": {"friction_angle", "cohesion"},
+    "snow": {"hardening_coefficient", "critical_compression", "critical_stretch"},
+    "foam": {"yield_stress", "viscosity", "flow_exponent"},
+    "fluid": {"bulk_modulus", "viscosity"},
+}
+FLOOR = {"point": jnp.asarray([0.0, 0.0, 0.4]), "normal": jnp.asarray([0.0, 0.0, 1.0])}
+
+
+def material(law, **numbers):
+    given = {"yield_stress": 1e3, "friction_angle": 0.6, "viscosity": 1.0, "bulk_modulus": 1e4, "fibre_stiffness": 1e4}
+    own = {name: given[name] for name in NUMBERS[law] if name in given}
+    return Material(law, **{**ELASTIC, **own, **numbers})
+
+
+def traced(materials=None, *, colliders=(), contact=None, **config):
+    """One step of two particles of the first material."""
+    table = material_table(materials or [material("neo_hookean")])
+    particles = make_particles(jnp.full((2, 3), 0.6), volume=1e-4, table=table)
+
+    def run(particles, table):
+        settings = SimConfig(substeps=1, devices=1, **config)
+        return rollout(
+            particles, DOMAIN, table, settings, frames=1, frame_dt=1e-3, gravity=(0.0, 0.0, -9.8), colliders=colliders,
+            contact=contact,
+        )  # fmt: skip
+
+    return jax.make_jaxpr(run)(particles, table)
+
+
+def text(program):
+    """The program, without the addresses of functions."""
+    return re.sub(r"0x[0-9a-f]+", "", str(program))
+
+
+def equations(jaxpr):
+    """All of them, nested ones included."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for value in equation.params.values():
+            for inner in value if isinstance(value, tuple | list) else [value]:
+                inner = getattr(inner, "jaxpr", inner)
+                if hasattr(inner, "eqns"):
+                    yield from equations(inner)
+
+
+def primitives(program):
+    return Counter(equation.primitive.name for equation in equations(program.jaxpr))
+
+
+def in_steps(program):
+    """What is done anew in each step, by primitive: the equations of the longest loop."""
+    loops = [e.params["jaxpr"].jaxpr for e in equations(program.jaxpr) if e.primitive.name == "scan"]
+    return max((Counter(e.primitive.name for e in equations(loop)) for loop in loops), key=Counter.total)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    """Of neo-Hookean matter and nothing else."""
+    return traced()
+
+
+def test_tracing_is_deterministic_and_this_test_sees_a_difference(plain):
+    assert text(traced()) == text(plain)
+    assert text(traced(walls="slip")) != text(plain)
+
+
+@pytest.mark.parametrize(
+    "off",
+    [
+        {"colliders": ()},
+        {"contact": None},
+        {"kernel": "quadratic"},
+        {"integrator": "explicit"},
+        {"differentiation": "reverse"},
+        {"stop": False},
+        {"force": True},  # of checks on the host only
+    ],
+    ids=lambda off: next(iter(off)),
+)
+def test_an_option_at_its_off_value_changes_nothing(plain, off):
+    assert text(traced(**off)) == text(plain)
+
+
+def test_numbers_that_no_law_present_reads_change_nothing(plain):
+    """Viscosity, hardening, fibres and the rest, given to elastic matter: the same program, for other values."""
+    foreign = {name: 0.5 for names in NUMBERS.values() for name in names}
+    assert text(traced([material("neo_hookean", **foreign)])) == text(plain)
+
+
+@pytest.mark.parametrize("law", NUMBERS)
+def test_a_law_reads_its_own_numbers_only(law):
+    numbers = {field.name: jnp.ones(()) for field in fields(Parameters)}
+    tensor, scalar = jnp.ones((3, 3, 2)), jnp.ones(2)
+    hardening = scalar if LAWS[law].hardens else None
+    program = jax.make_jaxpr(lambda m: respond(law, tensor, tensor, 1e-3, hardening, Parameters(**m)))(numbers).jaxpr
+    read = {id(variable) for equation in program.eqns for variable in equation.invars}
+    names = {name for name, variable in zip(sorted(numbers), program.invars) if id(variable) in read}
+    assert names == NUMBERS[law] | {"young", "poisson"}
+
+
+# what only the feature's own equations hold
+SIGNS = {
+    "cubic": (lambda: traced(kernel="cubic"), lambda p: "4,4,4" in text(p)),
+    "body contact": (lambda: traced(contact=BodyContact(bodies=2)), lambda p: in_steps(p)["scatter-add"] > 1),
+    "implicit steps": (lambda: traced(integrator="implicit"), lambda p: primitives(p)["while"] > 0),
+    "fibres": (lambda: traced([material("fibres")]), lambda p: primitives(p)["cos"] > 0),
+    "fluid": (lambda: traced([material("fluid")]), lambda p: primitives(p)["cbrt"] > 0),
+    "drucker_prager": (lambda: traced([material("drucker_prager")]), lambda p: primitives(p)["tan"] > 0),
+    "von_mises": (lambda: traced([material("von_mises")]), lambda p: primitives(p)["exp"] > 0),
+    "foam": (lambda: traced([material("foam")]), lambda p: primitives(p)["pow"] > 0),
+}
+
+
+@pytest.mark.parametrize("feature", SIGNS)
+def test_a_scene_without_a_feature_has_none_of_its_equations(plain, feature):
+    scene, has = SIGNS[feature]
+    assert has(scene())
+    assert not has(plain)
+
+
+def test_laws_of_the_table_without_particles_are_not_traced(plain):
+    unused = [material(law) for law in ("fibres", "fluid", "drucker_prager", "von_mises", "foam")]
+    program = traced([material("neo_hookean"), *unused])
+    for law in ("fibres", "fluid", "drucker_prager", "von_mises", "foam"):
+        assert not SIGNS[law][1](program), law
+    assert in_steps(program) == in_steps(plain)
+
+
+def test_colliders_at_rest_are_found_once_and_moving_ones_in_each_step(plain):
+    still = traced(colliders=(Plane(**FLOOR),))
+    moving = traced(colliders=(Plane(**FLOOR, velocity=jnp.ones(3)),))
+    turning = traced(colliders=(Plane(**FLOOR, angular_velocity=jnp.ones(3)),))
+    steps = [in_steps(program) for program in (plain, still, moving, turning)]
+    sizes = [step.total() for step in steps]
+    print("equations of a step: none, still, moving, turning", sizes, [step["iota"] for step in steps])
+    assert sizes == sorted(set(sizes))
+    nodes = [step["iota"] for step in steps]  # whose places a moving collider is asked about
+    assert nodes[0] == nodes[1] < nodes[2]
+    assert primitives(turning)["sin"] > 0
+    assert primitives(moving)["sin"] == primitives(plain)["sin"] == 0
+
+
+def test_matter_carries_only_the_state_that_its_law_has():
+    """No hardening where nothing hardens, no second deformation where F is the total one, no row of one material."""
+    for law in NUMBERS:
+        table = material_table([material(law)])
+        particles = make_particles(np.full((2, 3), 0.6), volume=1e-4, table=table)
+        (state,) = jax.eval_shape(lambda p, t=table: group_by_law(p, t, DOMAIN, 1).states, particles)
+        assert (state.hardening is not None) == LAWS[law].hardens, law
+        assert (state.visual is not None) == (not LAWS[law].total), law
+        assert state.row is None
