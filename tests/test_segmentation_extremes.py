@@ -126,6 +126,10 @@ def test_alpha_weighting_credits_what_has_no_surface():
     every = lift_masks(layers, facing_camera(), ONES, num_ids=3, weighting="alpha", min_votes=0)
     assert voters(every) == [0, 1]
     assert 0.1 < float(every.votes[1, 1]) < float(every.votes[0, 1]) < 0.5
+    stronger = on_axis([1.0], opacity_logit=np.log(0.4 / 0.6), scale=0.001)
+    most = lift_masks(stronger, facing_camera(), ONES, num_ids=3, weighting="alpha")
+    assert 0.5 < float(most.votes[0, 1]) < 1
+    assert voters(most) == [0]
 
 
 def test_a_floater_before_a_camera_takes_that_view_and_no_more():
@@ -155,8 +159,8 @@ def test_a_camera_inside_an_object_sees_it_from_within():
     x, y, z = ball.T
     ahead = (z > 0) & (np.abs(x) < z / 2) & (np.abs(y) < z / 2)
     assert voters(labels) == np.flatnonzero(ahead).tolist()
-    # closer than the near plane nothing is drawn, and nothing votes
-    assert voters(lift(on_axis([0.005, 1.0]), facing_camera(), ONES, num_ids=3)) == [1]
+    # closer than the near plane nothing is drawn, and nothing votes at any tolerance
+    assert voters(lift(on_axis([0.005, 1.0]), facing_camera(), ONES, num_ids=3, tau_d=1.0)) == [1]
 
 
 def test_ids_far_apart_work_as_they_are_and_compact():
