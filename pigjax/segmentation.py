@@ -18,7 +18,16 @@ from pigjax.camera import Camera
 from pigjax.chunks import static_capacity
 from pigjax.errors import InputError
 from pigjax.sightings import Scalar, check_masks, draw, front_of, is_known, pixel_under
-from pigjax.splat import Gaussians, RenderConfig, Splats, as_splats, blend_config, pairs_of, required_capacity
+from pigjax.splat import (
+    Gaussians,
+    RenderConfig,
+    Splats,
+    as_splats,
+    blend_config,
+    pairs_of,
+    project_splats,
+    required_capacity,
+)
 from pigjax.tile_walks import credits_of_candidates, soft_surface_depth
 
 _TIED_IDS = 4  # of more ids with equal votes, the lowest four compete
@@ -48,6 +57,7 @@ def lift_masks(
     ties: Literal["alpha", "lowest"] = "alpha",
     min_votes: Scalar | int = 1,
     purity: Scalar = 0.0,
+    min_seen: Scalar | None = None,
     config: RenderConfig = RenderConfig(),  # noqa: B008  (frozen)
 ) -> Labels:
     """Give every Gaussian the id that most views see at its place (PIG, section 3.2).
@@ -78,6 +88,9 @@ def lift_masks(
             Equal again: the lowest non-zero id. Soft counts and sums of alpha·T are not settled further.
         min_votes: with fewer votes than this (soft counts are rounded) a Gaussian stays unseen, id -1.
         purity: with a smaller share of the votes than this the winner is contested, and the id is 0.
+        min_seen: with weighting = "alpha", a Gaussian whose alpha·T is a smaller share than this of the alpha of its
+            whole footprints stays unseen, id -1: it is hidden nearly everywhere, so it may reach through a surface.
+            None asks nothing. For objects without fringes 0.03 with purity = 0.7 serves well.
         config: the renderer's settings.
 
     Raises:
@@ -88,9 +101,11 @@ def lift_masks(
     _check_choice("background", background, ("ignore", "vote"))
     _check_choice("weighting", weighting, ("centre", "alpha"))
     _check_choice("ties", ties, ("alpha", "lowest"))
-    for name, value in (("tau_T", tau_T), ("tau_d", tau_d), ("purity", purity)):
-        if is_known(value) and not 0 <= float(value) <= 1:
+    for name, value in (("tau_T", tau_T), ("tau_d", tau_d), ("purity", purity), ("min_seen", min_seen)):
+        if value is not None and is_known(value) and not 0 <= float(value) <= 1:
             raise InputError(f"{name} = {float(value):g}: it must lie in [0, 1].")
+    if min_seen is not None and weighting != "alpha":
+        raise InputError(f"min_seen = {min_seen} weighs what views see by alpha·T: use it with weighting = 'alpha'.")
     if temperature is not None:
         if weighting == "alpha":
             raise InputError("temperature has no thresholds to soften with weighting = 'alpha': leave it None.")
@@ -108,6 +123,9 @@ def lift_masks(
         overflow += _left_out(splats, cameras, walks)
     rerun = jax.tree_util.Partial(_credit_candidates, splats, cameras, masks, walks)
     object_id, confidence = _elect(votes, background, min_votes, purity, rerun if settled else None)
+    if min_seen is not None:
+        hidden = jnp.sum(votes, 1) < min_seen * _whole_footprints(splats, cameras, config)
+        object_id, confidence = jnp.where(hidden, -1, object_id), jnp.where(hidden, 0.0, confidence)
     return Labels(object_id, votes, confidence, overflow)
 
 
@@ -229,6 +247,21 @@ def _left_out(splats: Splats, cameras: Camera, config: RenderConfig):
         return jnp.maximum(pairs_of(splats, camera, config) - slots, 0)
 
     return jnp.sum(lax.map(of_view, cameras), dtype=jnp.int32)
+
+
+@eqx.filter_jit
+def _whole_footprints(splats: Splats, cameras: Camera, config: RenderConfig) -> Float[Array, "n"]:
+    """Sum of alpha over each whole footprint, also where it is hidden or beyond the image, over all views [px]."""
+
+    def of_view(total, camera):
+        projected = project_splats(splats, camera, config)
+        a, b, c = projected.conics.T
+        # the integral of o·exp(-q/2) where it exceeds alpha_min
+        above = jnp.maximum(projected.opacities - config.alpha_min, 0.0)
+        area = 2 * jnp.pi / jnp.sqrt(jnp.maximum(a * c - b * b, jnp.finfo(a.dtype).tiny))
+        return total + jnp.where(projected.visible, above * area, 0.0), None
+
+    return lax.scan(of_view, jnp.zeros(len(splats), splats.means.dtype), cameras)[0]
 
 
 def _soft_votes(splats: Splats, camera: Camera, tau_T, tau_d, temperature, config: RenderConfig):

@@ -100,6 +100,24 @@ def test_alpha_weighting_sums_alpha_times_transmittance(x64):
     np.testing.assert_allclose(labels.votes, credits, atol=1e-10)
 
 
+@pytest.mark.parametrize(("min_seen", "kept"), [(None, 3), (0.1, 2), (0.4, 2), (0.6, 1)])
+def test_what_views_see_too_little_of_stays_unseen(min_seen, kept):
+    """Two blobs on either side of a wall's edge and one behind it: seen whole, by half, and through what leaks."""
+    wall = np.stack([*np.meshgrid(np.arange(-0.5, 0.001, 0.05), np.arange(-0.5, 0.501, 0.05)), np.zeros((21, 11))], -1)
+    blobs = [[0.4, 0.0, 0.5], [0.02, 0.0, 0.5], [-0.3, 0.0, 0.5]]
+    means = np.concatenate([wall.reshape(-1, 3), blobs])
+    sizes = np.where(np.arange(len(means)) < len(means) - 3, 0.022, 0.05)
+    scene = Gaussians(
+        means, np.log(np.tile(sizes[:, None], 3)), np.tile([1.0, 0, 0, 0], (len(means), 1)),
+        np.full(len(means), 6.0), np.zeros((len(means), 1, 3)),
+    )  # fmt: skip
+    camera = stack_cameras([look_at((0.0, 0.0, -60.0), (0.0, 0.0, 0.0), focal=2000.0, width=64, height=64,
+                                    up=(0.0, 1.0, 0.0))])  # fmt: skip
+    masks = np.ones((1, 64, 64), int)
+    labels = lift_masks(scene, camera, masks, num_ids=2, weighting="alpha", min_seen=min_seen)
+    assert np.asarray(labels.object_id[-3:]).tolist() == [1] * kept + [-1] * (3 - kept)
+
+
 @pytest.mark.slow
 def test_alpha_weighting_of_many_ids_equals_that_of_few():
     scene, cameras, masks = make_scene(views=2)
@@ -314,6 +332,7 @@ def test_bad_input_is_refused_in_one_sentence():
         ("num_ids = 1", lambda: lift_masks(gaussians, camera, ONES, num_ids=1)),
         ("tau_T = 1.5", lambda: lift_masks(gaussians, camera, ONES, num_ids=2, tau_T=1.5)),
         ("tau_d = -0.1", lambda: lift_masks(gaussians, camera, ONES, num_ids=2, tau_d=-0.1)),
+        ("min_seen = 0.1 weighs", lambda: lift_masks(gaussians, camera, ONES, num_ids=2, min_seen=0.1)),
         ("temperature = 0", lambda: lift_masks(gaussians, camera, ONES, num_ids=2, temperature=0.0)),
         ("no views", lambda: lift_masks(gaussians, camera[:0], ONES[:0], num_ids=2)),
         ("no views", lambda: lift_masks(gaussians, camera[0], ONES, num_ids=2)),
