@@ -2,8 +2,9 @@
 
 Every Gaussian carries 16 numbers that are blended into the pixels like colour. A linear classifier, the same for all
 pixels, tells the id from them, and cross entropy against the masks trains both. A second term asks that neighbours in
-space are of one class. Widths, learning rates and weights are the paper's (and those of its published settings); the
-number of steps is smaller, and the geometry is fixed, so that all methods answer about the same Gaussians.
+space are of one class. Width and weights are those of the published settings. The geometry is fixed, so that all
+methods answer about the same Gaussians, and steps are fewer: rates are ten times the published 2.5e-3 and 5e-4 and fall
+to zero, with which 1,000 steps reach half the loss of 3,000 steps at the published ones.
 """
 
 from typing import NamedTuple
@@ -21,7 +22,7 @@ from pigjax.splat import Gaussians
 from .training import Fitted, draw, fit
 
 WIDTH = 16
-FEATURE_RATE, CLASSIFIER_RATE = 2.5e-3, 5e-4  # of Adam
+FEATURE_RATE, CLASSIFIER_RATE = 2.5e-2, 5e-3  # of Adam at the start
 NEIGHBOURS, SAMPLED, INTERVAL, WEIGHT = 5, 1000, 5, 2.0  # of the term in space: k, points, every so many steps, λ
 
 
@@ -54,8 +55,9 @@ def train_encoding(gaussians: Gaussians, views: Views, num_ids: int, *, steps: i
         jax.random.uniform(keys[1], (WIDTH, num_ids), minval=-bound, maxval=bound),
         jax.random.uniform(keys[2], (num_ids,), minval=-bound, maxval=bound),
     )
-    rates = {"features": optax.adam(FEATURE_RATE), "classifier": optax.adam(CLASSIFIER_RATE)}
-    optimizer = optax.partition(rates, Encoding("features", "classifier", "classifier"))
+    rates = {"features": FEATURE_RATE, "classifier": CLASSIFIER_RATE}
+    falling = {name: optax.adam(optax.cosine_decay_schedule(rate, steps)) for name, rate in rates.items()}
+    optimizer = optax.partition(falling, Encoding("features", "classifier", "classifier"))
     return fit(loss, start, optimizer, views, steps=steps, seed=seed)
 
 

@@ -12,7 +12,7 @@ from pigjax.camera import Camera
 from pigjax.io import Views
 from pigjax.splat import Gaussians, RenderConfig, render
 
-CHECKPOINTS = (0.25, 0.5, 1.0)  # shares of the steps after which the parameters are kept
+CHECKPOINTS = (1 / 8, 1 / 4, 1 / 2, 1)  # shares of the steps after which the parameters are kept
 
 
 class Fitted(NamedTuple):
