@@ -87,7 +87,8 @@ def study(
 
     curves = [[measured(row) for row in _curve(method, len(train))] for method in learnt]
     best = [max(curve, key=lambda row: row.scores[0]) for curve in curves]
-    rows = [*map(measured, ours), *best, measured(Row("axis-aligned box (as PhysGaussian)", boxes))]
+    box = measured(Row("axis-aligned box (as PhysGaussian)", boxes))
+    rows = [*map(measured, ours), *best, box]
     ceiling = [] if truth is None else [measured(Row("true ids", one_hot(truth)))]
 
     columns = ["isolated mIoU", "mBIoU", "visible mIoU", "mBIoU"] + ([] if truth is None else ["Gaussians right"])
@@ -108,7 +109,8 @@ def study(
     ]
     if folder is not None:
         number = next(number for number, name in names.items() if name == pictured)
-        draw_comparison(gaussians, rows, test, number, pictured, folder / "segmentation_baselines.png")
+        trained = [*ours, *(curve[-1] for curve in curves), box]
+        draw_comparison(gaussians, trained, test, number, pictured, folder / "segmentation_baselines.png")
     return "\n".join(lines)
 
 
@@ -194,7 +196,7 @@ def _head(*columns: str) -> list[str]:
 
 
 def _line(row: Row, *, loss: bool = False) -> str:
-    numbers = [f"{row.steps}" if row.steps else "none", "-" if row.seconds is None else f"{row.seconds:.1f}"]
+    numbers = [f"{row.steps}" if row.steps else "none", "-" if row.seconds is None else f"{row.seconds:.3g}"]
     numbers += [f"{row.loss:.4f}"] if loss else []
     numbers += [f"{score:.1f}" for score in row.scores[:4]] + [f"{score:.2f} %" for score in row.scores[4:]]
     return f"| {row.name} | " + " | ".join(numbers) + " |"
