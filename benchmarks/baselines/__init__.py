@@ -1,0 +1,1 @@
+"""Rivals' ways to find objects in a splat scene, re-made from their papers on pigjax's renderer for comparison."""
