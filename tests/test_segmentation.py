@@ -100,11 +100,11 @@ def test_alpha_weighting_sums_alpha_times_transmittance(x64):
     np.testing.assert_allclose(labels.votes, credits, atol=1e-10)
 
 
-@pytest.mark.parametrize(("min_seen", "kept"), [(None, 3), (0.1, 2), (0.4, 2), (0.6, 1)])
+@pytest.mark.parametrize(("min_seen", "kept"), [(None, 3), (0.1, 2), (0.3, 2), (0.7, 1)])
 def test_what_views_see_too_little_of_stays_unseen(min_seen, kept):
     """Two blobs on either side of a wall's edge and one behind it: seen whole, by half, and through what leaks."""
     wall = np.stack([*np.meshgrid(np.arange(-0.5, 0.001, 0.05), np.arange(-0.5, 0.501, 0.05)), np.zeros((21, 11))], -1)
-    blobs = [[0.4, 0.0, 0.5], [0.02, 0.0, 0.5], [-0.3, 0.0, 0.5]]
+    blobs = [[0.4, 0.0, 0.5], [0.03, 0.0, 0.5], [-0.3, 0.0, 0.5]]
     means = np.concatenate([wall.reshape(-1, 3), blobs])
     sizes = np.where(np.arange(len(means)) < len(means) - 3, 0.022, 0.05)
     scene = Gaussians(
