@@ -90,7 +90,7 @@ def lift_masks(
         purity: with a smaller share of the votes than this the winner is contested, and the id is 0.
         min_seen: with weighting = "alpha", a Gaussian whose alpha·T is a smaller share than this of the alpha of its
             whole footprints stays unseen, id -1: it is hidden nearly everywhere, so it may reach through a surface.
-            None asks nothing. For objects without fringes 0.03 with purity = 0.7 serves well.
+            None asks nothing. For objects without fringes 0.05 with purity = 0.6 serves well.
         config: the renderer's settings.
 
     Raises:

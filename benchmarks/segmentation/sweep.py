@@ -1,0 +1,163 @@
+"""What thresholds, views and resolution do to a vote, and gradient descent on the thresholds from a bad start."""
+
+import statistics
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import optax
+from jax.scipy.special import logit
+
+from pigjax.segmentation import enough_capacity, lift_masks
+from pigjax.splat import RenderConfig
+from segmentation.tabletop import Tabletop
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+PLOT = "segmentation_sweep.png"
+TAU_T = (0.05, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95)
+TAU_D = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
+EVERY, SIZES = (1, 2, 4, 8, 16), (256, 128, 64)
+BAD_STARTS = ((0.95, 0.5), (0.05, 0.001), (0.98, 0.003))
+STEPS, RATE, TEMPERATURE = 60, 0.15, 0.02
+
+
+class Descent(NamedTuple):
+    taus: list[tuple[float, float]]  # (tau_T, tau_d) after each step
+    losses: list[float]
+    seconds: float
+    right_before: float  # share right of the hard vote of all views, at the start
+    right_after: float
+
+
+def study(scene: Tabletop, folder: Path) -> str:
+    """Tables in Markdown and one plot in `folder`: share of Gaussians with their true id; unseen ones are wrong."""
+    thresholds = sweep_thresholds(scene)
+    rows = ["| tau_T \\ tau_d | " + " | ".join(f"{value:g}" for value in TAU_D) + " |", "|---" * (len(TAU_D) + 1) + "|"]
+    rows += [f"| {tau_T:g} | " + " | ".join(f"{v:.4f}" for v in line) + " |" for tau_T, line in zip(TAU_T, thresholds)]
+    views = sweep_views(scene)
+    rows += ["", "| views | pixels | right | time [s] | ms a view |", "|---|---|---|---|---|"]
+    for (count, size), (right, seconds) in views.items():
+        rows.append(f"| {count} | {size}² | {right:.4f} | {seconds:.2f} | {1e3 * seconds / count:.0f} |")
+    rows += ["", "| from (tau_T, tau_d) | right | to | right | loss | time [s] |", "|---|---|---|---|---|---|"]
+    paths = descend(scene, BAD_STARTS)
+    for path in paths:
+        (a, b), (c, d) = path.taus[0], path.taus[-1]
+        ends = f"{a:.3g}, {b:.3g} | {path.right_before:.4f} | {c:.3g}, {d:.3g} | {path.right_after:.4f}"
+        rows.append(f"| {ends} | {path.losses[0]:.3f} → {path.losses[-1]:.3f} | {path.seconds:.0f} |")
+    _plot(thresholds, views, paths, folder / PLOT)
+    return "\n".join(rows)
+
+
+def sweep_thresholds(scene: Tabletop) -> np.ndarray:
+    """Share right [tau_T tau_d], all tau_d of one tau_T vmapped over one pass of depths."""
+    train = scene.train
+
+    def lift(tau_T, tau_d):
+        return lift_masks(scene.gaussians, train.cameras, train.masks, num_ids=scene.num_ids, tau_T=tau_T,
+                          tau_d=tau_d, ties="lowest").object_id  # fmt: skip
+
+    over_tau_d = jax.jit(jax.vmap(lift, (None, 0)))
+    return np.array([np.mean(np.asarray(over_tau_d(a, jnp.asarray(TAU_D))) == scene.truth, 1) for a in TAU_T])
+
+
+def sweep_views(scene: Tabletop) -> dict[tuple[int, int], tuple[float, float]]:
+    """Share right and warm seconds by number of views and by pixels along a side."""
+    results = {}
+    for size in SIZES:
+        pixel = (np.arange(size) * 2 + 1) * scene.train.masks.shape[1] // (2 * size)
+        for every in EVERY:
+            train = scene.train[::every]
+            cameras, masks = train.cameras.resized(size, size), train.masks[:, pixel[:, None], pixel]
+
+            def lift(cameras=cameras, masks=masks):
+                labels = lift_masks(scene.gaussians, cameras, masks, num_ids=scene.num_ids)
+                return np.asarray(labels.object_id)
+
+            found, seconds = lift(), []
+            for _ in range(3):
+                begun = time.perf_counter()
+                lift()
+                seconds.append(time.perf_counter() - begun)
+            results[len(masks), size] = float(np.mean(found == scene.truth)), statistics.median(seconds)
+    return results
+
+
+def descend(scene: Tabletop, starts: Iterable[tuple[float, float]], size: int = 64) -> list[Descent]:
+    """Adam on (tau_T, tau_d) of the soft vote, kept within (0, 1) by their logits.
+
+    The loss is the mean -log of the share of its soft votes that a Gaussian gives its true id, with a twentieth of a
+    vote for every id, so that Gaussians without votes cost log(num_ids). Eight views of `size`² pixels.
+    """
+    train = scene.train[::4]
+    pixel = (np.arange(size) * 2 + 1) * train.masks.shape[1] // (2 * size)
+    cameras, masks = train.cameras.resized(size, size), train.masks[:, pixel[:, None], pixel]
+    config = enough_capacity(scene.gaussians, cameras, RenderConfig())
+    rows = jnp.arange(len(scene.gaussians))
+    optimizer = optax.adam(RATE)
+
+    def loss(logits):
+        tau_T, tau_d = jax.nn.sigmoid(logits)
+        labels = lift_masks(scene.gaussians, cameras, masks, num_ids=scene.num_ids, tau_T=tau_T, tau_d=tau_d,
+                            temperature=TEMPERATURE, config=config)  # fmt: skip
+        votes = labels.votes + 0.05
+        return -jnp.mean(jnp.log(votes[rows, scene.truth] / jnp.sum(votes, 1)))
+
+    @jax.jit
+    def step(logits, state):
+        value, slope = jax.value_and_grad(loss)(logits)
+        updates, state = optimizer.update(slope, state)
+        return optax.apply_updates(logits, updates), state, value
+
+    def from_(start):
+        logits = logit(jnp.array(start))
+        state, taus, losses = optimizer.init(logits), [start], []
+        begun = time.perf_counter()
+        for _ in range(STEPS):
+            logits, state, value = step(logits, state)
+            taus.append(tuple(jax.nn.sigmoid(logits).tolist()))
+            losses.append(float(value))
+        spent = time.perf_counter() - begun
+        return Descent(taus, losses, spent, _right(scene, *taus[0]), _right(scene, *taus[-1]))
+
+    step(logit(jnp.array([0.5, 0.5])), optimizer.init(jnp.zeros(2)))  # compiles, outside the times
+    return list(map(from_, starts))
+
+
+def _right(scene: Tabletop, tau_T: float, tau_d: float) -> float:
+    train = scene.train
+    labels = lift_masks(
+        scene.gaussians, train.cameras, train.masks, num_ids=scene.num_ids, tau_T=tau_T, tau_d=tau_d, ties="lowest"
+    )
+    return float(np.mean(np.asarray(labels.object_id) == scene.truth))
+
+
+def _plot(thresholds, views, paths, file: Path) -> None:
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+    mesh = left.contourf(TAU_D, TAU_T, thresholds, levels=np.linspace(0, 1, 21), cmap="viridis")
+    figure.colorbar(mesh, ax=left, label="share of Gaussians right")
+    for path in paths:
+        tau_T, tau_d = np.transpose(path.taus)
+        left.plot(tau_d, tau_T, "w.-", lw=1, ms=3)
+        left.plot(tau_d[0], tau_T[0], "wo", ms=7, mfc="none")
+        left.plot(tau_d[-1], tau_T[-1], "r*", ms=11)
+    left.set(xscale="log", xlabel="tau_d", ylabel="tau_T", title="thresholds; descent from circles to stars")
+    for size, colour in zip(SIZES, ("#1f5fa8", "#d1671b", "#3a8f4d")):
+        points = [(seconds, share, n) for (n, pixels), (share, seconds) in views.items() if pixels == size]
+        seconds, share, counts = np.transpose(points)
+        right.plot(seconds, 100 * share, "o-", color=colour, label=f"{size}² pixels")
+        for x, y, n in zip(seconds, 100 * share, counts):
+            right.annotate(f"{n:.0f}", (x, y), textcoords="offset points", xytext=(4, -9), fontsize=8, color=colour)
+    right.set(
+        xscale="log", xlabel="time of the vote [s]", ylabel="Gaussians right [%]", title="views (numbers) and pixels"
+    )
+    right.grid(alpha=0.25)
+    right.legend(frameon=False)
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
