@@ -17,7 +17,6 @@ from pigjax.errors import InputError
 from pigjax.sightings import Scalar, check_masks, front_of
 from pigjax.splat import Gaussians, RenderConfig, Splats, as_splats
 
-_MOST_ROUNDS = 5  # over all views; the second or third seldom changes anything
 _LEAST_SHOWN = 0.1  # share of a group that a view must show to say what the group belongs to
 _SAMPLE = 20_000  # Gaussians that the order of the views is chosen by
 
@@ -53,9 +52,9 @@ def associate_masks(
 
     The Gaussians that a mask shows, by the test of `lift_masks`, are compared with those of each group of a growing
     bank (Gaga; Lyu et al. 2024), views that share most Gaussians with the bank first. Within a view the assignment is
-    one-to-one and maximises the sum of the overlaps; a mask without a group founds one. All views are then assigned
-    anew against the bank of the others until nothing changes. At last the groups that are pieces of one object join:
-    those that mostly lie in one mask where a view shows both (view consensus; Yan et al. 2024, MaskClustering).
+    one-to-one and maximises the sum of the overlaps; a mask without a group founds one. At last the groups that are
+    pieces of one object join: those that mostly lie in one mask where a view shows both (view consensus; Yan et al.
+    2024, MaskClustering), which makes up for what an early view did not know.
 
     Args:
         gaussians: the scene.
@@ -132,17 +131,18 @@ def _assign(views: Sequence[_View], counts: Sequence[int], count: int, threshold
     groups = [np.full(number, -1) for number in counts]
     shape = count, sum(counts)
     bank = sparse.csr_array(shape, dtype=np.float32)  # how often each Gaussian was seen in each group
-    order = _most_shared_first(views, count)
-    for _ in range(_MOST_ROUNDS):
-        changed = False
-        for index in order:
-            view, old = views[index], groups[index]
-            others = bank - _sightings(view, old, shape) if np.any(old >= 0) else bank
-            new = _match(view, old, others, threshold)
-            if np.any(new != old):
-                groups[index], bank, changed = new, others + _sightings(view, new, shape), True
-        if not changed:
-            break
+    known = 0
+    for index in _most_shared_first(views, count):
+        group = groups[index]
+        overlap = _overlaps(views[index], len(group), bank)
+        overlap = np.where(overlap >= threshold, overlap, 0.0)
+        masks, taken = linear_sum_assignment(overlap, maximize=True)
+        matched = overlap[masks, taken] > 0
+        group[masks[matched]] = taken[matched]
+        founders = np.setdiff1d(views[index].masks, [0, *masks[matched]])
+        group[founders] = known + np.arange(len(founders))
+        known += len(founders)
+        bank = bank + _sightings(views[index], group, shape)
     return groups
 
 
@@ -163,25 +163,6 @@ def _most_shared_first(views: Sequence[_View], count: int) -> list[int]:
         order.append(best)
         left[best] = False
     return order
-
-
-def _match(view: _View, old: np.ndarray, bank: sparse.csr_array, threshold: float) -> np.ndarray:
-    """Groups of the masks of a view: the best one-to-one assignment, and new groups for the rest."""
-    overlap = _overlaps(view, len(old), bank)
-    overlap = np.where(overlap >= threshold, overlap, 0.0)
-    masks, taken = linear_sum_assignment(overlap, maximize=True)
-    matched = overlap[masks, taken] > 0
-    groups = np.full(len(old), -1)
-    groups[masks[matched]] = taken[matched]
-    empty = np.ones(bank.shape[1], bool)
-    empty[bank.indices] = False
-    founders = np.setdiff1d(view.masks, [0, *masks[matched]])
-    keep = [mask for mask in founders if old[mask] >= 0 and empty[old[mask]]]
-    groups[keep] = old[keep]
-    empty[old[keep]] = False
-    founders = np.setdiff1d(founders, keep)
-    groups[founders] = np.flatnonzero(empty)[: len(founders)]
-    return groups
 
 
 def _overlaps(view: _View, count: int, bank: sparse.csr_array) -> np.ndarray:

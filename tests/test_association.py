@@ -5,6 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
+from segmentation.association import score, spoil
+from segmentation.tabletop import load_tabletop
 
 from pigjax.association import associate_masks, compact_ids
 from pigjax.camera import orbit
@@ -151,6 +153,20 @@ def test_a_mask_of_nothing_becomes_background():
     masks[:, 0, :4] = 3  # the sky in a corner
     found = associate_masks(BALLS, CAMERAS, masks)
     assert same_partition(found.masks, TRUTH)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"missing": 0.3, "split": 0.3, "fused": 0.3}], ids=["whole", "spoiled"])
+def test_tabletop_with_scrambled_ids_is_lifted_as_with_consistent_ones(options):
+    scene = load_tabletop()
+    cameras = scene.train.cameras
+    consistent, scrambled = spoil(scene.train.masks, **options)
+    expected = score(scene, cameras, consistent, scene.num_ids)
+    found = associate_masks(scene.gaussians, cameras, scrambled)
+    scores = score(scene, cameras, found.masks, found.num_ids)
+    print("right, mIoU, mBIoU:", scores, "with consistent ids:", expected)
+    assert found.num_ids == scene.num_ids
+    assert np.all(np.divide(scores, expected) > 0.99)
 
 
 @given(arrays(np.uint16, array_shapes(min_dims=3, max_dims=3, max_side=5), elements=st.integers(0, 65535)))

@@ -34,11 +34,11 @@ def study(scene: Tabletop) -> list[str]:
         every = options.pop("every", 1)
         train = scene.train[::every]
         consistent, scrambled = spoil(train.masks, **options)
-        expected = _score(scene, train.cameras, consistent, scene.num_ids)
+        expected = score(scene, train.cameras, consistent, scene.num_ids)
         start = time.perf_counter()
         found = associate_masks(scene.gaussians, train.cameras, scrambled)
         seconds = time.perf_counter() - start
-        right, iou, boundary = _score(scene, train.cameras, found.masks, found.num_ids)
+        right, iou, boundary = score(scene, train.cameras, found.masks, found.num_ids)
         rows.append(
             f"| {name} | {found.num_ids - 1} of {scene.num_ids - 1} | {right:.4f} | {right / expected[0]:.3f} "
             f"| {iou:.2f} | {boundary:.2f} | {iou / expected[1]:.3f} | {seconds:.1f} |"
@@ -69,7 +69,7 @@ def spoil(masks, *, missing=0.0, split=0.0, fused=0.0, seed=0) -> tuple[np.ndarr
     return consistent, scrambled
 
 
-def _score(scene: Tabletop, cameras, masks, num_ids: int) -> tuple[float, float, float]:
+def score(scene: Tabletop, cameras, masks, num_ids: int) -> tuple[float, float, float]:
     """Share of Gaussians right, mIoU and mBIoU [%] on the test views, ids named after the objects they fit."""
     labels = lift_masks(scene.gaussians, cameras, masks, num_ids=num_ids)
     found = np.asarray(fill_unseen(scene.gaussians, labels).object_id)

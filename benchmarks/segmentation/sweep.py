@@ -140,14 +140,16 @@ def _right(scene: Tabletop, tau_T: float, tau_d: float) -> float:
 
 def _plot(thresholds, views, paths, file: Path) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
-    mesh = left.contourf(TAU_D, TAU_T, thresholds, levels=np.linspace(0, 1, 21), cmap="viridis")
-    figure.colorbar(mesh, ax=left, label="share of Gaussians right")
+    wrong = left.pcolormesh(TAU_D, TAU_T, 1 - thresholds, norm="log", cmap="viridis_r", shading="gouraud")
+    figure.colorbar(wrong, ax=left, label="share of Gaussians wrong")
     for path in paths:
         tau_T, tau_d = np.transpose(path.taus)
-        left.plot(tau_d, tau_T, "w.-", lw=1, ms=3)
-        left.plot(tau_d[0], tau_T[0], "wo", ms=7, mfc="none")
+        left.plot(tau_d, tau_T, "k.-", lw=1, ms=3)
+        left.plot(tau_d[0], tau_T[0], "ko", ms=7, mfc="none")
         left.plot(tau_d[-1], tau_T[-1], "r*", ms=11)
-    left.set(xscale="log", xlabel="tau_d", ylabel="tau_T", title="thresholds; descent from circles to stars")
+    left.set(
+        xscale="log", ylim=(0, 1), xlabel="tau_d", ylabel="tau_T", title="thresholds; descent from circles to stars"
+    )
     for size, colour in zip(SIZES, ("#1f5fa8", "#d1671b", "#3a8f4d")):
         points = [(seconds, share, n) for (n, pixels), (share, seconds) in views.items() if pixels == size]
         seconds, share, counts = np.transpose(points)
@@ -157,6 +159,8 @@ def _plot(thresholds, views, paths, file: Path) -> None:
     right.set(
         xscale="log", xlabel="time of the vote [s]", ylabel="Gaussians right [%]", title="views (numbers) and pixels"
     )
+    right.xaxis.set_major_formatter("{x:g}")
+    right.xaxis.set_minor_formatter("")
     right.grid(alpha=0.25)
     right.legend(frameon=False)
     figure.savefig(file, dpi=110)
