@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -29,6 +29,14 @@ from pigjax.errors import InputError, SimulationError
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 _console = Console(stderr=True)
 _MOST_DEVICES = 8  # an image has too few rows of tiles for more
+TauT = Annotated[float, typer.Option(help="Transmittance that marks the surface.", min=0, max=1)]
+TauD = Annotated[float, typer.Option(help="Relative depth tolerance of a vote.", min=0, max=1)]
+Weighting = Annotated[str, typer.Option(help="centre: the paper's vote; alpha: credit by alpha·T.")]
+Purity = Annotated[float, typer.Option(help="Least share of the votes to be of an object.", min=0, max=1)]
+MinSeen = Annotated[
+    float | None, typer.Option(help="With --weighting alpha: least share of a Gaussian that views see.", min=0, max=1)
+]
+Fill = Annotated[bool, typer.Option(help="Give unseen Gaussians the id of their neighbours; not with --min-seen.")]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")]
 
 
@@ -191,6 +199,13 @@ def reconstruct(
     )
 
 
+def _settings(tau_t: float, tau_d: float, weighting: str, purity: float, min_seen: float | None) -> dict[str, Any]:
+    """Of the vote; what competes with objects by alpha·T is the background too."""
+    background = "vote" if weighting == "alpha" else "ignore"
+    thresholds = {"tau_T": tau_t, "tau_d": tau_d, "purity": purity, "min_seen": min_seen}
+    return {**thresholds, "weighting": weighting, "background": background}
+
+
 @app.command()
 def segment(
     gaussians: Annotated[Path, typer.Argument(help="Trained .ply, .splat or .spz.")],
@@ -198,11 +213,12 @@ def segment(
     out: Out = Path("segments"),
     masks: Annotated[Path | None, typer.Option(help="Folder of masks, if it lies elsewhere.")] = None,
     names: Annotated[Path | None, typer.Option(help="JSON of mask ids and names.")] = None,
-    tau_t: Annotated[float, typer.Option(help="Transmittance that marks the surface.", min=0, max=1)] = 0.5,
-    tau_d: Annotated[float, typer.Option(help="Relative depth tolerance of a vote.", min=0, max=1)] = 0.03,
-    fill: Annotated[bool, typer.Option(help="Give unseen Gaussians the id of their neighbours.")] = True,
-    weighting: Annotated[str, typer.Option(help="centre: the paper's vote; alpha: credit by alpha·T.")] = "centre",
-    purity: Annotated[float, typer.Option(help="Least share of the votes to be of an object.", min=0, max=1)] = 0.0,
+    tau_t: TauT = 0.5,
+    tau_d: TauD = 0.03,
+    weighting: Weighting = "centre",
+    purity: Purity = 0.0,
+    min_seen: MinSeen = None,
+    fill: Fill = True,
     remove: Annotated[list[str] | None, typer.Option(help="Object to leave out, by name or id; repeat it.")] = None,
 ) -> None:
     """Lift masks to the Gaussians; writes labels, one .ply per object, and a sheet that shows which id is which.
@@ -215,7 +231,7 @@ def segment(
     cloud = io.load_gaussians(gaussians)
     loaded = io.load_views(views, masks=masks if masks is not None else True)
     known = {} if names is None else {int(k): str(v) for k, v in io.read_json(names).items()}
-    settings = {"tau_T": tau_t, "tau_d": tau_d, "weighting": weighting, "purity": purity}
+    settings = _settings(tau_t, tau_d, weighting, purity, min_seen)
     counts = segment_files(cloud, loaded, known, out, fill=fill, remove=remove or (), **settings)
     table = Table("id", "object", "Gaussians")
     for number, count in counts.items():
@@ -234,9 +250,12 @@ def evaluate(
     labels: Annotated[Path | None, typer.Option(help="labels.npz of 'pigjax segment', instead of lifting.")] = None,
     prompts: Annotated[Path | None, typer.Option(help="JSON {prompt: id}.")] = None,
     reference: Annotated[str | None, typer.Option(help="View whose truth gives each prompt its object.")] = None,
-    tau_t: Annotated[float, typer.Option(help="Transmittance that marks the surface.", min=0, max=1)] = 0.5,
-    tau_d: Annotated[float, typer.Option(help="Relative depth tolerance of a vote.", min=0, max=1)] = 0.03,
-    fill: Annotated[bool, typer.Option(help="Give unseen Gaussians the id of their neighbours.")] = True,
+    tau_t: TauT = 0.5,
+    tau_d: TauD = 0.03,
+    weighting: Weighting = "centre",
+    purity: Purity = 0.0,
+    min_seen: MinSeen = None,
+    fill: Fill = True,
     holes: Annotated[int, typer.Option(help="Close holes of up to this many pixels in the masks.", min=0)] = 0,
     max_size: Annotated[int | None, typer.Option(help="Shrink photos to this many pixels.")] = None,
 ) -> None:
@@ -256,7 +275,7 @@ def evaluate(
 
         report = evaluate_files(
             cloud, read, out, labels=labels, prompts=prompts, reference=reference,
-            tau_T=tau_t, tau_d=tau_d, fill=fill, progress=tell,
+            fill=fill, progress=tell, **_settings(tau_t, tau_d, weighting, purity, min_seen),
         )  # fmt: skip
     scores = report.evaluation.scores
     table = Table("prompt", "object", "views", *(f"{level} mIoU / mBIoU %" for level in scores))

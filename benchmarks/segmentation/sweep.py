@@ -161,6 +161,7 @@ def _plot(thresholds, views, paths, file: Path) -> None:
     )
     right.xaxis.set_major_formatter("{x:g}")
     right.xaxis.set_minor_formatter("")
+    right.set_xticks([0.2, 0.5, 1, 2, 5])
     right.grid(alpha=0.25)
     right.legend(frameon=False)
     figure.savefig(file, dpi=110)

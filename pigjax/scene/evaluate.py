@@ -16,11 +16,11 @@ from pigjax.evaluation import Evaluation, evaluate_labels, ground_prompts, pixel
 from pigjax.io.files import existing
 from pigjax.metrics import mean_iou
 from pigjax.overlay import comparison_sheet
-from pigjax.segmentation import Labels, fill_unseen, lift_masks
+from pigjax.scene.lifting import lift
+from pigjax.segmentation import Labels, fill_unseen
 from pigjax.splat import Gaussians
 
 _MOST_ROWS = 24
-_MOST_IDS = 65536  # votes are counted per Gaussian and id
 
 
 class Report(NamedTuple):
@@ -40,10 +40,9 @@ def evaluate_files(
     labels: Path | None = None,
     prompts: Path | None = None,
     reference: str | None = None,
-    tau_T: float = 0.5,
-    tau_d: float = 0.03,
     fill: bool = True,
     progress: Callable[[str, int, int], None] = lambda stage, done, of: None,
+    **settings: Any,
 ) -> Report:
     """Score labelled Gaussians on a data set; writes `scores.json` and `sheet.png` into `out`. Host.
 
@@ -56,17 +55,19 @@ def evaluate_files(
             object that overlaps its truth best in the reference view.
         reference: name of that view, which also overrules the data set's names; if not given, the view with most
             prompts.
-        tau_T: see `lift_masks`.
-        tau_d: see `lift_masks`.
         fill: give Gaussians that no view saw the id of their neighbours.
         progress: called with the stage, steps done and of all.
+        settings: of `lift_masks`.
 
     Raises:
         InputError: files that do not fit each other, or cannot be written.
     """
     progress("lift", 0, 1)
-    lifted = _read_labels(labels, len(gaussians)) if labels else _lift(gaussians, dataset, tau_T, tau_d)
-    lifted = fill_unseen(gaussians, lifted) if fill else lifted
+    if labels is None:
+        lifted = _lift(gaussians, dataset, fill=fill, **settings)
+    else:
+        lifted = _read_labels(labels, len(gaussians))
+        lifted = fill_unseen(gaussians, lifted) if fill else lifted
     progress("lift", 1, 1)
     cameras = {view: dataset.test.cameras[i] for i, view in enumerate(dataset.test.names)}
     objects, grounding = _grounding(gaussians, lifted, dataset, cameras, prompts, reference)
@@ -76,21 +77,15 @@ def evaluate_files(
     )  # fmt: skip
     views = {prompt: sum(at == prompt for _, at in dataset.truths) for prompt in objects}
     report = Report(evaluation, grounding, dataset.black, views)
-    io.write_json(out / "scores.json", _as_json(report) | {"tau_T": tau_T, "tau_d": tau_d, "filled": fill})
+    io.write_json(out / "scores.json", _as_json(report) | settings | {"filled": fill})
     io.write_image(out / "sheet.png", comparison_sheet(_rows(dataset, evaluation)))
     return report
 
 
-def _lift(gaussians: Gaussians, dataset: io.Dataset, tau_T: float, tau_d: float) -> Labels:
+def _lift(gaussians: Gaussians, dataset: io.Dataset, **settings: Any) -> Labels:
     if dataset.masks is None or dataset.cameras is None:
         raise InputError("the data set was read without masks that vote; give labels.npz, or read it with vote=True.")
-    num_ids = int(dataset.masks.max()) + 1
-    if num_ids > _MOST_IDS:
-        raise InputError(
-            f"masks hold the id {num_ids - 1}, which numbers annotations rather than objects; give the objects ids"
-            f" below {_MOST_IDS} that are the same in all views."
-        )
-    return lift_masks(gaussians, dataset.cameras, dataset.masks, num_ids=num_ids, tau_T=tau_T, tau_d=tau_d)
+    return lift(gaussians, dataset.cameras, dataset.masks, **settings)
 
 
 def _read_labels(path: Path, count: int) -> Labels:

@@ -16,8 +16,9 @@ from pigjax.editing import extract_object, hole_mask, remove_object
 from pigjax.errors import InputError, MissingFileError
 from pigjax.overlay import id_colours, id_image, legend_sheet, overlay
 from pigjax.pruning import contributions
+from pigjax.scene.lifting import lift
 from pigjax.scene.schema import load_scene, suggest
-from pigjax.segmentation import Labels, fill_unseen, lift_masks
+from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, render, sh_degree_of
 
 _SHEET_VIEWS = 4
@@ -57,10 +58,8 @@ def segment_files(
     doomed = [_id_of(name, names) for name in remove]
     train = views.subset("train") if "train" in views.splits else views
     assert train.masks is not None
-    num_ids = int(np.max(train.masks)) + 1
-    labels = lift_masks(gaussians, train.cameras, train.masks, num_ids=num_ids, **settings)
-    if fill:
-        labels = fill_unseen(gaussians, labels)
+    labels = lift(gaussians, train.cameras, train.masks, fill=fill, **settings)
+    num_ids = labels.votes.shape[1]
     object_id = np.asarray(labels.object_id)
     (out / "objects").mkdir(parents=True, exist_ok=True)
     np.savez_compressed(out / "labels.npz", object_id=object_id, votes=labels.votes, confidence=labels.confidence)

@@ -23,8 +23,9 @@ from pigjax.materials import Material, MaterialTable
 from pigjax.matter import Particles
 from pigjax.mls_mpm import SimConfig
 from pigjax.particles import Binding, bind, seed_particles
+from pigjax.scene.lifting import lift
 from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec, suggest
-from pigjax.segmentation import Labels, fill_unseen, lift_masks
+from pigjax.segmentation import Labels
 from pigjax.sleep import Sleep
 from pigjax.solids import collider_from_gaussians
 from pigjax.splat import Gaussians
@@ -102,19 +103,17 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
         return Labels(jnp.full(count, only, jnp.int32), jnp.zeros((count, only + 1), jnp.int32), jnp.ones(count))
     views = inputs.views.subset("train") if "train" in inputs.views.splits else inputs.views
     assert views.masks is not None
-    num_ids = max([int(np.max(views.masks)), *inputs.ids.values()]) + 1
-    labels = lift_masks(
+    labels = lift(
         inputs.gaussians,
         views.cameras,
         views.masks,
-        num_ids=num_ids,
+        num_ids=max(inputs.ids.values(), default=0) + 1,
+        fill=spec.fill_unseen,
         tau_T=spec.tau_T,
         tau_d=spec.tau_d,
         background=spec.background,
     )
-    if spec.fill_unseen:
-        labels = fill_unseen(inputs.gaussians, labels)
-    found = np.bincount(np.maximum(labels.object_id, 0), minlength=num_ids)
+    found = np.bincount(np.maximum(labels.object_id, 0), minlength=labels.votes.shape[1])
     for name, number in inputs.ids.items():
         if found[number] == 0:
             raise SceneError(f"objects.{name}: no Gaussian has its id {number} in the masks; check input.masks.")
