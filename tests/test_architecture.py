@@ -18,7 +18,7 @@ FLOORS = [
     {"tiles", "colliders", "transfers", "contact"},
     {"splat", "matter", "passes"},
     {"tile_walks", "clamp", "shells", "relocation", "starts", "overlay", "substep", "io", "sightings"},
-    {"filling", "implicit"},
+    {"filling", "implicit", "fitting"},
     {"frames"},
     {"boxes"},
     {"sleep"},
@@ -32,7 +32,7 @@ FLOORS = [
 FLOOR_OF = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
 # the two worlds meet in particles.py and solids.py only
 SPLATS = {"splat", "lists", "footprints", "chunks", "bands", "tiles", "tile_walks", "clamp", "segmentation"}
-SPLATS |= {"sightings", "association"}
+SPLATS |= {"sightings", "association", "fitting"}
 SPLATS |= {"starts", "relocation", "reconstruct", "filling", "shells", "pruning", "editing", "evaluation"}
 MATTER = {
     "matter",
