@@ -97,6 +97,7 @@ def height(young, speed, **config):
     return (end.x[:, 2] ** 2).sum() + (end.x[:, 0] ** 3).sum()
 
 
+@pytest.mark.slow
 def test_every_mode_and_number_of_devices_gives_the_same_derivatives(x64):
     one, two = (jax.grad(partial(height, devices=devices), (0, 1))(2e4, 0.1) for devices in (1, 2))
     np.testing.assert_allclose(two, one, rtol=1e-9)

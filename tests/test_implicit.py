@@ -31,6 +31,7 @@ def run(particles, table, substeps, *, colliders=(), gravity=(0.0, 0.0, -9.8), f
     return rollout(particles, DOMAIN, table, settings, **steps)
 
 
+@pytest.mark.slow
 def test_implicit_steps_tend_to_the_explicit_solution_at_first_order(x64):
     """A squeezed block swings freely."""
     particles, table = block()

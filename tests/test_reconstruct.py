@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pigjax import io
+from pigjax import fitting, io
 from pigjax.camera import orbit
 from pigjax.errors import InputError
 from pigjax.linalg import matrix_to_quat
@@ -275,21 +275,16 @@ def test_growth_that_cannot_reach_its_end_is_a_clear_error(change, message):
         FitConfig(**change)
 
 
-def test_steps_of_any_number_compile_once(views):
+def test_steps_of_any_number_compile_once(views, monkeypatch):
     """Previews cut the run into uneven pieces; each piece is the same program."""
     loaded, points = views
-    module = sys.modules["pigjax.reconstruct"]
     traces = []
-    original = module._loss
+    original = fitting._loss
 
     def counted(*arguments):
         traces.append(1)
         return original(*arguments)
 
-    module._loss = counted
-    try:
-        config = replace(CONFIG, steps=60, preview_every=7, seed=3)
-        reconstruct(loaded, config, points=points)
-    finally:
-        module._loss = original
+    monkeypatch.setattr(fitting, "_loss", counted)
+    reconstruct(loaded, replace(CONFIG, steps=60, preview_every=7, seed=3), points=points)
     assert len(traces) == 1
