@@ -116,8 +116,9 @@ def stages(text):
     _, times["colour"], rgb = measure(colours, splats, camera)
     _, times["order"], boxes = measure(lambda p: front_to_back(p, blending), projected)
     shapes, tiles = projected.shapes[boxes.order], jnp.ones(blending.tiles, bool)
-    listing = lambda s, b, t: list_pass(s, b, 0, t, blending, blending.slots)  # noqa: E731
-    _, times["first list"], _ = measure(listing, shapes, boxes, tiles)
+    _, times["first list"], _ = measure(
+        lambda s, b, t: list_pass(s, b, 0, t, blending, blending.slots), shapes, boxes, tiles
+    )
     _, times["order+lists+blend"], _ = measure(lambda p, f: blend(p, f, blending)[:2], projected, rgb)
     slope = jax.grad(lambda p, f: jnp.sum(blend(p, f, blending).features ** 2), argnums=1)
     _, times["the same and backward"], _ = measure(slope, projected, rgb)
@@ -153,9 +154,8 @@ def growth(bands):
     gaussians, camera = ball(10_000, 256, 256)
     for views in (1, 4, 16):
         cameras = stack_cameras([camera] * views)
-        one_by_one = lambda g, c: lax.map(lambda c: render(g, c).rgb, c)  # noqa: E731
-        batched = jax.vmap(lambda g, c: render(g, c).rgb, (None, 0))
-        times = [measure(f, gaussians, cameras, repeats=5)[1] for f in (one_by_one, batched)]
+        ways = (lambda g, c: lax.map(lambda c: render(g, c).rgb, c), jax.vmap(lambda g, c: render(g, c).rgb, (None, 0)))
+        times = [measure(way, gaussians, cameras, repeats=5)[1] for way in ways]
         print(f"    {views:3} views of 10k / 256²: lax.map {times[0] * 1e3:.1f} ms, vmap {times[1] * 1e3:.1f} ms")
     scene = replicate(ball(1_000_000, 1920, 1080), bands)
     series["1M / 1080p"] = [(1_000_000, time_both(scene, config))]

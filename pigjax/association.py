@@ -46,7 +46,7 @@ def associate_masks(
     merge: float = 0.5,
     tau_T: Scalar = 0.5,
     tau_d: Scalar = 0.03,
-    config: RenderConfig = RenderConfig(),  # noqa: B008  (frozen)
+    config: RenderConfig = RenderConfig(),
 ) -> Association:
     """Link the masks of all views that show one object. Host.
 

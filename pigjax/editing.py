@@ -42,7 +42,7 @@ def hole_mask(
     camera: Camera,
     *,
     seen: Bool[Array, "n"] | Float[Array, "n"],
-    config: RenderConfig = RenderConfig(),  # noqa: B008  (frozen)
+    config: RenderConfig = RenderConfig(),
 ) -> Bool[Array, "h w"]:
     """Pixels that an object hides and that hold nothing known once it is gone: what an inpainter must fill in.
 

@@ -35,7 +35,7 @@ def evaluate_labels(
     truths: Mapping[tuple[str, str], Bool[np.ndarray, "_ _"]],
     objects: Mapping[str, int | None],
     *,
-    config: RenderConfig = RenderConfig(),  # noqa: B008  (frozen)
+    config: RenderConfig = RenderConfig(),
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Evaluation:
     """mIoU and mBIoU of labelled Gaussians by the protocol of Gaussian Grouping, host.
@@ -86,7 +86,7 @@ def pixel_ids(
     camera: Camera,
     *,
     keep: Sequence[int] = (),
-    config: RenderConfig = RenderConfig(),  # noqa: B008
+    config: RenderConfig = RenderConfig(),
 ) -> tuple[Int[np.ndarray, "h w"], dict[int, Float[np.ndarray, "h w"]]]:
     """The id with the largest share of each pixel, and the shares of the ids in `keep`, host.
 

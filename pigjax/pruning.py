@@ -19,7 +19,7 @@ from pigjax.splat import Gaussians, RenderConfig, render
 def contributions(
     gaussians: Gaussians,
     cameras: Camera,
-    config: RenderConfig = RenderConfig(),  # noqa: B008  (frozen)
+    config: RenderConfig = RenderConfig(),
 ) -> Float[Array, "n"]:
     """Sum of alpha·T of each Gaussian over all pixels of a batch of cameras: how much of the pictures it is."""
     ones = jnp.ones((len(gaussians), 1), gaussians.means.dtype)
@@ -40,7 +40,7 @@ def prune(
     views: io.Views | Camera,
     budget: int,
     *,
-    config: RenderConfig = RenderConfig(),  # noqa: B008
+    config: RenderConfig = RenderConfig(),
 ) -> Gaussians:
     """The `budget` Gaussians that contribute most to these views, in their old order. Host.
 

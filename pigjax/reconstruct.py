@@ -71,7 +71,7 @@ class Reconstruction:
 
 def reconstruct(
     views: io.Views,
-    config: FitConfig = FitConfig(),  # noqa: B008  (frozen)
+    config: FitConfig = FitConfig(),
     *,
     points: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]] | None = None,
     checkpoint: Path | None = None,

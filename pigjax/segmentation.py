@@ -58,7 +58,7 @@ def lift_masks(
     min_votes: Scalar | int = 1,
     purity: Scalar = 0.0,
     min_seen: Scalar | None = None,
-    config: RenderConfig = RenderConfig(),  # noqa: B008  (frozen)
+    config: RenderConfig = RenderConfig(),
 ) -> Labels:
     """Give every Gaussian the id that most views see at its place (PIG, section 3.2).
 
@@ -136,7 +136,7 @@ def object_mask(
     camera: Camera,
     *,
     mode: Literal["isolated", "visible"] = "isolated",
-    config: RenderConfig = RenderConfig(),  # noqa: B008
+    config: RenderConfig = RenderConfig(),
 ) -> Float[Array, "h w"]:
     """Coverage of one object in a view, 0 to 1.
 

@@ -110,7 +110,7 @@ def as_splats(gaussians: Gaussians | Splats) -> Splats:
 def render(
     gaussians_or_splats: Gaussians | Splats,
     camera: Camera,
-    config: RenderConfig = RenderConfig(),  # noqa: B008  (frozen)
+    config: RenderConfig = RenderConfig(),
     *,
     background: Float[Array, "*c"] | float = 0.0,
     outputs: Sequence[str] = ("rgb", "alpha"),
@@ -185,7 +185,7 @@ def _render(gaussians_or_splats, camera, config, background, outputs, given, tau
 def surface_depth(
     gaussians: Gaussians | Splats,
     camera: Camera,
-    config: RenderConfig = RenderConfig(),  # noqa: B008
+    config: RenderConfig = RenderConfig(),
     *,
     tau_T: Float[Array, ""] | float = 0.5,
 ) -> Float[Array, "h w"]:
@@ -195,7 +195,7 @@ def surface_depth(
     return depth
 
 
-def required_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: RenderConfig = RenderConfig()) -> int:  # noqa: B008
+def required_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: RenderConfig = RenderConfig()) -> int:
     """Box/tile pairs that the fullest of these cameras has, host. A capacity at least this large never overflows."""
     splats = as_splats(gaussians)
     batch = cameras if cameras.world_to_cam.ndim == 3 else stack_cameras([cameras])

@@ -114,7 +114,7 @@ def classic():
     what the gradients cost: their weights times the stress for 27 or 64 nodes, and three more sums on the way back,
     whose terms are shared as far as they can be. Times are of a substep of 10k random particles at dx = 1/64 m in
     float32, the least of 21 windows in turn on a shared machine. `MLS` is what the library does; the problems are those
-    of `kernels`, `bars` and `axis_aligned`. MLS saves an eighth of the substep, and is no less exact.
+    of `kernels`, `bars` and `axis_aligned`. What MLS saves is the first row of each kernel; it is no less exact.
     """
     rows = []
     for kernel in KERNELS:

@@ -103,4 +103,5 @@ def _plain(value: Any) -> Any:
         return os.fspath(value)
     if hasattr(value, "__array__"):
         return np.asarray(value).tolist()
+    # msgspec asks its hooks to say so of what they do not know; `write_json` makes an InputError of it
     raise NotImplementedError(f"{type(value).__name__} {value!r}")
