@@ -1,0 +1,298 @@
+"""A scene as a pure function of named parameters: what studies vary, simulate, draw and score.
+
+Parameters have the names of the scene file's fields: "objects.duck.young", "objects.duck.velocity", "clamp.lambda_R",
+"simulation.gravity", "planes.ground.friction". A scene file is read once; from there all is arrays, so that an
+experiment can be jitted, vmapped and differentiated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+from scipy.cluster.vq import kmeans2
+
+from pigjax.camera import Camera
+from pigjax.clamp import ClampParams
+from pigjax.colliders import Collider
+from pigjax.contact import BodyContact
+from pigjax.errors import SceneError
+from pigjax.materials import MaterialTable, Parameters
+from pigjax.matter import Grid, Health, Particles, Trajectory, fit_grid, vast_grid
+from pigjax.mls_mpm import SimConfig, choose_integrator, choose_substeps, rollout
+from pigjax.particles import Binding, at_frame, deform
+from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, segment
+from pigjax.scene.schema import Scene, suggest
+from pigjax.splat import Gaussians, RenderConfig, Splats, render
+
+_NUMBERS = tuple(field.name for field in fields(Parameters))
+_CLAMP = ("tau_min", "tau_max", "lambda_R", "lambda_S")
+
+
+class Outcome(NamedTuple):
+    """An experiment and how its simulation went."""
+
+    experiment: Experiment
+    particles: Particles  # at the end
+    trajectory: Trajectory
+    health: Health
+
+
+class Experiment(eqx.Module):
+    """All that a scene needs to be simulated and drawn, on one grid that holds the whole motion."""
+
+    gaussians: Gaussians
+    particles: Particles  # at rest
+    table: MaterialTable
+    binding: Binding | None
+    grid: Grid
+    colliders: tuple[Collider, ...]
+    contact: BodyContact | None
+    gravity: Float[Array, "3"]  # [m/s²]
+    frame_dt: Float[Array, ""]  # [s]
+    clamp: ClampParams
+    cameras: Camera  # one for each frame of the video, the first at rest
+    background: Float[Array, "*3"]
+    config: SimConfig = eqx.field(static=True)
+    render: RenderConfig = eqx.field(static=True)
+    mode: str = eqx.field(static=True)  # of the clamp
+    frames: int = eqx.field(static=True)
+    rows: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)  # of the table, by moving object
+    solids: tuple[str, ...] = eqx.field(static=True)  # names of the colliders: "objects.table", "planes.ground"
+
+    def with_parameters(self, values: Mapping[str, Any]) -> Experiment:
+        """The same experiment with other numbers.
+
+        A number of an object that was split into regions may be one for all of it or one for each.
+
+        Raises:
+            SceneError: a name that the scene has not, with the nearest right one.
+        """
+        changed = self
+        for name, value in values.items():
+            changed = changed._with(name, jnp.asarray(value, self.particles.x.dtype))
+        return changed
+
+    def value(self, name: str) -> Float[Array, "..."]:
+        """Present value of a parameter.
+
+        Raises:
+            SceneError: a name that the scene has not, or one without a value.
+        """
+        kind, middle, field = self._split(name)
+        if kind == "clamp":
+            return getattr(self.clamp, field)
+        if kind == "simulation":
+            return self.contact.friction if self.contact and field == "contact_friction" else getattr(self, field)
+        if name.rpartition(".")[0] in self.solids:
+            own = getattr(self.colliders[self.solids.index(f"{kind}.{middle}")], field)
+            if own is None:
+                raise SceneError(f"{name}: the scene gives it no value; state one in the scene file.")
+            return own
+        rows = np.array(dict(self.rows)[middle])
+        if field == "velocity":
+            mine = jnp.isin(self.particles.material, rows)
+            return jnp.where(mine[:, None], self.particles.v, 0.0).sum(0) / mine.sum()
+        values = getattr(self.table, field)[rows]
+        return values[0] if len(rows) == 1 else values
+
+    def names(self) -> tuple[str, ...]:
+        """Every parameter that `with_parameters` takes."""
+        own = [f"objects.{name}.{field}" for name, _ in self.rows for field in ("velocity", *_NUMBERS)]
+        numbers = [
+            f"{solid}.{field.name}"
+            for solid, collider in zip(self.solids, self.colliders)
+            for field in fields(collider)
+            if not field.metadata.get("static", False) and field.name != "elapsed"
+        ]
+        simulation = ["gravity", "frame_dt", *(["contact_friction"] if self.contact is not None else [])]
+        return (*own, *(f"clamp.{f}" for f in _CLAMP), *(f"simulation.{f}" for f in simulation), *numbers)
+
+    def simulate(self) -> Outcome:
+        """Simulate all frames."""
+        end, trajectory, health = rollout(
+            self.particles,
+            self.grid,
+            self.table,
+            self.config,
+            frames=self.frames,
+            frame_dt=self.frame_dt,
+            gravity=self.gravity,
+            colliders=self.colliders,
+            contact=self.contact,
+        )
+        return Outcome(self, end, trajectory, health)
+
+    def splats(self, trajectory: Trajectory, frame: Any) -> Splats:
+        """The posed scene after a frame, counted from 0."""
+        moved = at_frame(self.particles, trajectory, frame)
+        return deform(self.gaussians, moved, self.clamp, mode=self.mode, binding=self.binding)
+
+    def picture(self, trajectory: Trajectory, frame: Any) -> Float[Array, "h w 3"]:
+        """The scene after a frame, seen by the camera of that frame."""
+        splats = self.splats(trajectory, frame)
+        rgb = render(splats, self.cameras[frame + 1], self.render, background=self.background, outputs=("rgb",)).rgb
+        assert rgb is not None
+        return rgb
+
+    def video(self, trajectory: Trajectory) -> Float[Array, "t h w 3"]:
+        """All frames, one after the other so that memory is that of one."""
+        picture = jax.checkpoint(partial(self.picture, trajectory))
+        return lax.map(picture, jnp.arange(self.frames))
+
+    def _split(self, name: str) -> tuple[str, str, str]:
+        """Section, entry and field of a parameter's name."""
+        if name not in self.names():
+            raise SceneError(f"parameter {name}: this scene has none of that name; {suggest(name, self.names())}.")
+        section, _, rest = name.partition(".")
+        entry, _, field = rest.rpartition(".")
+        return section, entry, field
+
+    def _with(self, name: str, value: Array) -> Experiment:
+        section, entry, field = self._split(name)
+        change: dict[str, Any] = {field: value}
+        if section == "clamp":
+            return replace(self, clamp=replace(self.clamp, **change))
+        if section == "simulation":
+            return self._with_simulation(field, value)
+        if f"{section}.{entry}" in self.solids:
+            at = self.solids.index(f"{section}.{entry}")
+            solid = replace(self.colliders[at], **change)
+            return replace(self, colliders=(*self.colliders[:at], solid, *self.colliders[at + 1 :]))
+        rows = np.array(dict(self.rows)[entry])
+        particles = self.particles
+        if field == "velocity":
+            mine = jnp.isin(particles.material, rows)[:, None]
+            return replace(self, particles=replace(particles, v=jnp.where(mine, value, particles.v)))
+        table = replace(self.table, **{field: getattr(self.table, field).at[rows].set(value)})
+        if field == "density":
+            mass = particles.volume0 * table.density[particles.material]
+            particles = replace(particles, mass=mass.astype(particles.mass.dtype))
+        return replace(self, table=table, particles=particles)
+
+    def _with_simulation(self, field: str, value: Array) -> Experiment:
+        if self.contact is not None and field == "contact_friction":
+            return replace(self, contact=replace(self.contact, friction=value))
+        if field == "frame_dt":
+            return replace(self, frame_dt=value)
+        if value.ndim == 0:  # as in the scene file: downwards
+            value = value * self.gravity / jnp.linalg.norm(self.gravity)
+        return replace(self, gravity=value)
+
+
+def experiment(
+    scene: Scene,
+    *,
+    extremes: Iterable[Mapping[str, Any]] = (),
+    regions: Mapping[str, int] | None = None,
+    margin: float = 0.1,
+    edit: Callable[[Plan, Inputs], Plan] | None = None,
+) -> Experiment:
+    """Read a scene and make an experiment of it. Host.
+
+    The substeps are those of the most demanding of `extremes`, and the grid holds the motion of the scene as it is and
+    of each of them: matter that goes further meets the domain's wall and is counted in `Health.escaped`.
+
+    Args:
+        scene: as `load_scene` gives it.
+        extremes: parameters at the ends of a study, as `Experiment.with_parameters` takes them.
+        regions: number of parts that an object is split into, by place, so that its numbers may differ from part to
+            part; rows of the table, which cost nothing more.
+        margin: room around the motion [m].
+        edit: last changes to what will be simulated.
+
+    Raises:
+        InputError: a file is missing or damaged, or the scene asks for something that cannot be.
+        SimulationError: the scene as it is, or one of `extremes`, breaks down.
+    """
+    inputs = read_inputs(scene)
+    plan = make_plan(scene, inputs, segment(scene, inputs))
+    if edit is not None:
+        plan = edit(plan, inputs)
+    made = _assemble(scene, inputs, plan)
+    for name, count in (regions or {}).items():
+        made = _split_object(made, name, count)
+    return _fitted(made, scene.simulation.dx, [{}, *extremes], margin)
+
+
+def _assemble(scene: Scene, inputs: Inputs, plan: Plan) -> Experiment:
+    spec, camera = scene.simulation, scene.camera
+    moving = [name for name, entry in scene.objects.items() if not entry.fixed]
+    sections = {name: getattr(scene, name) for name in ("planes", "boxes", "spheres", "capsules", "cylinders")}
+    solids = [f"objects.{name}" for name, entry in scene.objects.items() if entry.fixed]
+    solids += [f"{section}.{name}" for section, entries in sections.items() for name in entries]
+    dtype = plan.particles.x.dtype
+    return Experiment(
+        gaussians=inputs.gaussians,
+        particles=plan.particles,
+        table=plan.table,
+        binding=plan.binding,
+        grid=vast_grid(spec.dx),
+        colliders=plan.colliders,
+        contact=plan.contact,
+        gravity=jnp.asarray(plan.gravity, dtype),
+        frame_dt=jnp.asarray(plan.frame_dt, dtype),
+        clamp=plan.clamp,
+        cameras=make_cameras(scene, inputs, np.asarray(plan.particles.x).mean(0)),
+        background=jnp.asarray(camera.background, dtype),
+        config=plan.config,
+        render=RenderConfig(),
+        mode=scene.clamp.mode,
+        frames=spec.frames,
+        rows=tuple((name, (row,)) for row, name in enumerate(moving)),
+        solids=tuple(solids),
+    )
+
+
+def _split_object(made: Experiment, name: str, count: int) -> Experiment:
+    """New rows of the table for the parts of an object; the first part keeps the old row."""
+    known = dict(made.rows)
+    if name not in known:
+        raise SceneError(f"regions: {name}: no such moving object; {suggest(name, known)}.")
+    (row,) = known[name]
+    material = np.array(made.particles.material)
+    mine = np.flatnonzero(material == row)
+    _, part = kmeans2(np.asarray(made.particles.x, np.float64)[mine], count, minit="++", seed=0)
+    _, part = np.unique(part, return_inverse=True)  # k-means may leave a part empty
+    rows = np.array([row, *range(len(made.table), len(made.table) + part.max())])
+    material[mine] = rows[part]
+    index = np.concatenate([np.arange(len(made.table)), np.full(len(rows) - 1, row)])
+    table = MaterialTable(
+        laws=tuple(made.table.laws[k] for k in index), **{f: getattr(made.table, f)[index] for f in _NUMBERS}
+    )
+    counts = tuple(int(n) for n in np.bincount(material, minlength=len(table)))
+    particles = replace(made.particles, material=jnp.asarray(material, jnp.int32), counts=counts)
+    parts = tuple((other, tuple(int(r) for r in rows) if other == name else own) for other, own in made.rows)
+    return replace(made, table=table, particles=particles, rows=parts)
+
+
+def _fitted(made: Experiment, dx: float, extremes: list[Mapping[str, Any]], margin: float) -> Experiment:
+    """With substeps and a grid that serve all extremes."""
+    near = fit_grid(made.particles.x, dx)
+    cases = [made.with_parameters(values) for values in extremes]
+
+    def steps(case: Experiment) -> dict[str, Any]:
+        return {
+            "frames": case.frames,
+            "frame_dt": float(case.frame_dt),
+            "gravity": np.asarray(case.gravity),
+            "colliders": case.colliders,
+        }
+
+    config = choose_integrator(made.particles, near, made.table, made.config, **steps(made))
+    substeps = max(choose_substeps(case.particles, near, case.table, config, **steps(case)) for case in cases)
+    config = replace(config, substeps=substeps)
+    reached = [np.asarray(made.particles.x)]
+    for case in cases:
+        outcome = replace(case, config=config).simulate()
+        outcome.health.raise_if_bad()
+        reached.append(np.asarray(outcome.trajectory.x).reshape(-1, 3))
+    return replace(made, config=config, grid=fit_grid(np.concatenate(reached), dx, margin=margin))
