@@ -8,7 +8,7 @@ from pigjax.io.images import contact_sheet, read_image, write_image
 from pigjax.io.masks import load_masks, save_masks
 from pigjax.io.ply import load_ply, load_points, read_ply, save_ply
 from pigjax.io.state import last_state, load_pytree, load_state, save_pytree, save_state
-from pigjax.io.video import write_video
+from pigjax.io.video import read_video, write_video
 
 __all__ = [
     "LAYOUTS",
@@ -28,6 +28,7 @@ __all__ = [
     "read_image",
     "read_json",
     "read_ply",
+    "read_video",
     "save_masks",
     "save_ply",
     "save_pytree",

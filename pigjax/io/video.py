@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -9,11 +10,11 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from PIL import Image
 
 from pigjax.errors import InputError
-from pigjax.io.files import PathLike, writing
+from pigjax.io.files import PathLike, existing, writing
 from pigjax.io.images import Picture, rgb_uint8
 
 _H264 = ["-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
@@ -43,6 +44,27 @@ def write_video(path: PathLike, frames: Iterable[Picture], *, fps: float | int) 
         raise InputError(f"{path}: no frames were given; give at least one.")
     with writing(path) as partial:
         encode(partial, first, pixels, fps)
+
+
+def read_video(path: PathLike) -> Float[np.ndarray, "t h w 3"]:
+    """Frames of a video in 0..1. Host.
+
+    Raises:
+        MissingFileError: there is no such file.
+        InputError: it is no video that ffmpeg reads.
+    """
+    import imageio_ffmpeg  # not at the top: it would slow down every import of pigjax
+
+    path = existing(path, "video")
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", path, "-f", "image2pipe", "-c:v", "ppm", "-"]
+    done = subprocess.run(command, capture_output=True, check=False)
+    header = re.match(rb"P6\s+(\d+)\s+(\d+)\s+255\s", done.stdout)
+    if done.returncode or header is None:
+        said = done.stderr.decode(errors="replace").strip().splitlines()
+        raise InputError(f"{path}: not a video that ffmpeg reads{': ' + said[-1] if said else ''}.")
+    width, height = map(int, header.groups())
+    frames = np.frombuffer(done.stdout, np.uint8).reshape(-1, header.end() + 3 * width * height)
+    return frames[:, header.end() :].reshape(-1, height, width, 3).astype(np.float32) / 255
 
 
 def _checked(frames: Iterable[Picture], path: PathLike) -> Iterator[UInt8[np.ndarray, "h w 3"]]:

@@ -18,7 +18,7 @@ from pigjax.camera import Camera, orbit, stack_cameras
 from pigjax.clamp import ClampParams
 from pigjax.colliders import Collider
 from pigjax.contact import BodyContact
-from pigjax.errors import SceneError
+from pigjax.errors import InputError, SceneError
 from pigjax.materials import Material, MaterialTable
 from pigjax.matter import Particles
 from pigjax.mls_mpm import SimConfig
@@ -157,7 +157,7 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
     )
     binding = bind(inputs.gaussians, labels, particles)
     gravity = spec.gravity
-    vector = np.array(gravity) if isinstance(gravity, tuple) else -gravity * _axis(scene.input.up)
+    vector = np.array(gravity) if isinstance(gravity, tuple) else -gravity * axis_of(scene.input.up)
     return Plan(
         particles=particles,
         table=table,
@@ -197,7 +197,7 @@ def _still_solids(scene: Scene, inputs: Inputs, labels: Labels) -> dict[str, Col
             solids[name] = collider_from_gaussians(
                 own,
                 spacing=scene.simulation.dx / 2,
-                up=_axis(scene.input.up),
+                up=axis_of(scene.input.up),
                 others=np.delete(np.asarray(inputs.gaussians.means), members, axis=0),
                 friction=entry.friction,
                 name=f"objects.{name}",
@@ -217,7 +217,14 @@ def _without_buried(inputs: Inputs, labels: Labels, solids: dict[str, Collider],
     return labels
 
 
-def _axis(name: str) -> Float[np.ndarray, "3"]:
+def axis_of(name: str) -> Float[np.ndarray, "3"]:
+    """Unit vector of an axis by its name, "-y".
+
+    Raises:
+        InputError: it has another name.
+    """
+    if name.removeprefix("-") not in ("x", "y", "z"):
+        raise InputError(f"up = {name!r}: choose one of x, y, z, -x, -y, -z.")
     return np.eye(3)["xyz".index(name[-1])] * (-1 if name.startswith("-") else 1)
 
 
@@ -249,7 +256,7 @@ def make_cameras(scene: Scene, inputs: Inputs, focus: Float[np.ndarray, "3"]) ->
         height=spec.height,
         start=np.radians(spec.start),
         sweep=np.radians(spec.sweep),
-        up=_axis(scene.input.up),
+        up=axis_of(scene.input.up),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -265,7 +266,7 @@ def scene_from(values: dict[str, Any], *, folder: str | Path = ".", where: str =
     try:
         scene = msgspec.convert({**values, "folder": str(folder)}, Scene)
     except msgspec.ValidationError as error:
-        raise SceneError(f"{where}: {_explain(str(error), values)}") from None
+        raise SceneError(f"{where}: {explain(str(error), values, _fields_at)}") from None
     _check(scene, where)
     return scene
 
@@ -298,8 +299,14 @@ def _check(scene: Scene, where: str) -> None:
     scene.colliders()
 
 
-def _explain(message: str, values: dict[str, Any]) -> str:
-    """msgspec's message with the place first and, for an unknown field, the nearest right name."""
+def explain(message: str, values: dict[str, Any], fields_at: Callable[[str], Sequence[str]]) -> str:
+    """msgspec's message with the place first and, for an unknown field, the nearest right name.
+
+    Args:
+        message: of the validation error.
+        values: what was to be decoded.
+        fields_at: names of the fields of a place such as "objects.duck".
+    """
     place = re.search(r" - at `(key in )?\$\.?([^`]*)`$", message)
     at = place.group(2).replace("[...]", "") if place else ""
     message = re.sub(r" - at `.*`$", "", message)
@@ -307,9 +314,9 @@ def _explain(message: str, values: dict[str, Any]) -> str:
     if unknown is None:
         return f"{at or 'top level'}: {message[0].lower()}{message[1:]}."
     name = unknown.group(1)
-    known = _fields_at(at)
-    if at.split(".")[0] in ("objects", *_COLLIDERS):
-        table = values.get(at.split(".")[0], {})
+    known = fields_at(at)
+    table = values.get(at.split(".")[0], {})
+    if isinstance(table, dict) and name not in table:  # msgspec does not say in which entry
         at = next((f"{at}.{key}" for key, entry in table.items() if isinstance(entry, dict) and name in entry), at)
     return f"{at + '.' if at else ''}{name}: unknown field; {suggest(name, known)}."
 

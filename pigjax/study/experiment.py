@@ -7,6 +7,7 @@ experiment can be jitted, vmapped and differentiated.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, replace
 from functools import partial
@@ -24,10 +25,10 @@ from pigjax.camera import Camera
 from pigjax.clamp import ClampParams
 from pigjax.colliders import Collider
 from pigjax.contact import BodyContact
-from pigjax.errors import SceneError
-from pigjax.materials import MaterialTable, Parameters
+from pigjax.errors import InputError, SceneError
+from pigjax.materials import Material, MaterialTable, Parameters
 from pigjax.matter import Grid, Health, Particles, Trajectory, fit_grid, vast_grid
-from pigjax.mls_mpm import SimConfig, choose_integrator, choose_substeps, rollout
+from pigjax.mls_mpm import SimConfig, choose_integrator, choose_substeps, rollout, stable_dt
 from pigjax.particles import Binding, at_frame, deform
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, segment
 from pigjax.scene.schema import Scene, suggest
@@ -116,6 +117,28 @@ class Experiment(eqx.Module):
         simulation = ["gravity", "frame_dt", *(["contact_friction"] if self.contact is not None else [])]
         return (*own, *(f"clamp.{f}" for f in _CLAMP), *(f"simulation.{f}" for f in simulation), *numbers)
 
+    def check(self) -> None:
+        """Whether all materials are possible and the step is stable for them. Host.
+
+        Raises:
+            InputError: a number is out of range, or waves or viscosity need a shorter step.
+        """
+        names = {row: name for name, rows in self.rows for row in rows}
+        for row, law in enumerate(self.table.laws):
+            numbers = {field: getattr(self.table, field)[row] for field in _NUMBERS}
+            try:
+                Material(model=law, **numbers)
+            except InputError as error:
+                raise SceneError(f"objects.{names[row]}.{error}") from None
+        speed = jnp.linalg.norm(self.particles.v, axis=-1).max()
+        limit = stable_dt(self.table, self.grid, max_speed=speed, cfl=1.0, integrator=self.config.integrator)
+        dt = float(self.frame_dt) / (self.config.substeps or 1)
+        if not dt <= float(limit):
+            raise InputError(
+                f"simulation: steps of {dt:.3g} s are longer than {float(limit):.3g} s, the longest that is stable with"
+                " these numbers: name them among the extremes of the experiment."
+            )
+
     def simulate(self) -> Outcome:
         """Simulate all frames."""
         end, trajectory, health = rollout(
@@ -194,6 +217,7 @@ def experiment(
     extremes: Iterable[Mapping[str, Any]] = (),
     regions: Mapping[str, int] | None = None,
     margin: float = 0.1,
+    alone: bool = False,
     edit: Callable[[Plan, Inputs], Plan] | None = None,
 ) -> Experiment:
     """Read a scene and make an experiment of it. Host.
@@ -207,20 +231,41 @@ def experiment(
         regions: number of parts that an object is split into, by place, so that its numbers may differ from part to
             part; rows of the table, which cost nothing more.
         margin: room around the motion [m].
+        alone: leave out the Gaussians of objects that the scene does not name; otherwise they are drawn as they stand.
         edit: last changes to what will be simulated.
 
     Raises:
         InputError: a file is missing or damaged, or the scene asks for something that cannot be.
-        SimulationError: the scene as it is, or one of `extremes`, breaks down.
+        SimulationError: matter flies too far apart for a grid.
     """
     inputs = read_inputs(scene)
-    plan = make_plan(scene, inputs, segment(scene, inputs))
+    with warnings.catch_warnings():
+        if alone:
+            warnings.filterwarnings("ignore", message="the scene says nothing of")
+        plan = make_plan(scene, inputs, segment(scene, inputs))
+    if alone:
+        inputs, plan = _only_named(inputs, plan)
     if edit is not None:
         plan = edit(plan, inputs)
     made = _assemble(scene, inputs, plan)
     for name, count in (regions or {}).items():
         made = _split_object(made, name, count)
     return _fitted(made, scene.simulation.dx, [{}, *extremes], margin)
+
+
+def _only_named(inputs: Inputs, plan: Plan) -> tuple[Inputs, Plan]:
+    """Without the Gaussians of other objects; what is left is counted anew."""
+    object_id = np.asarray(plan.labels.object_id)
+    kept = np.isin(object_id, [0, *inputs.ids.values()])
+    row = jnp.asarray(np.cumsum(kept) - 1)
+    labels = jax.tree.map(lambda column: column[kept] if column.ndim else column, plan.labels)
+    carried = plan.particles.gaussian
+    particles = replace(plan.particles, gaussian=jnp.where(carried >= 0, row[carried], -1).astype(carried.dtype))
+    binding = plan.binding
+    if binding is not None:
+        binding = replace(binding, gaussian=row[binding.gaussian])
+    gaussians = jax.tree.map(lambda column: column[kept], inputs.gaussians)
+    return replace(inputs, gaussians=gaussians), replace(plan, particles=particles, binding=binding, labels=labels)
 
 
 def _assemble(scene: Scene, inputs: Inputs, plan: Plan) -> Experiment:
@@ -293,6 +338,5 @@ def _fitted(made: Experiment, dx: float, extremes: list[Mapping[str, Any]], marg
     reached = [np.asarray(made.particles.x)]
     for case in cases:
         outcome = replace(case, config=config).simulate()
-        outcome.health.raise_if_bad()
         reached.append(np.asarray(outcome.trajectory.x).reshape(-1, 3))
     return replace(made, config=config, grid=fit_grid(np.concatenate(reached), dx, margin=margin))

@@ -1,0 +1,192 @@
+"""Running a study file: sweep or tune, saved as it goes; leaves a table, plots, and a scene file of the best."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tomli_w
+
+from pigjax import io
+from pigjax.errors import InputError, SceneError
+from pigjax.study.experiment import Experiment, Outcome, experiment
+from pigjax.study.objectives import Objective, Scores, objective_of
+from pigjax.study.schema import Study, Value
+from pigjax.study.voting import Voting, voting
+from pigjax.tune import Bounds, History, Table, fit, search, sweep
+
+Row = Mapping[str, Any]
+_SOFT_VOTES = 0.03  # temperature of a tuned vote that states none
+
+
+def sweep_study(study: Study, out_dir: str | Path, *, progress: Callable[[int, int], Any] | None = None) -> Table:
+    """Score every set of parameters of a study. Host.
+
+    Into `out_dir` go `table.csv`, `table.npz`, `sweep.png` (a curve of one parameter, a heat map of two), `best.json`
+    and `best.toml`, the scene with the best values. What is finished is kept, so that a killed sweep goes on. Where
+    all parameters are of the clamp, one simulation serves all.
+
+    Raises:
+        InputError: a file is missing, a parameter or an objective is unknown, or nothing could be scored.
+    """
+    out = _made(out_dir)
+    rows = _rows(study)
+    trial, shared = _trial(study, rows, soft=False)
+    table = sweep(
+        trial,
+        rows,
+        shared=shared,
+        batch=study.sweep.batch,
+        check=partial(_check, shared[0]),
+        resume=out / "rows",
+        callback=progress,
+    )
+    if jax.process_index() == 0:
+        table.save(out / "table.csv")
+        table.save(out / "table.npz")
+        _draw(study, table, out / "sweep.png")
+        _leave_best(study, table.best(study.sweep.of, mode=study.sweep.best), out)
+    return table
+
+
+def tune_study(
+    study: Study, out_dir: str | Path, *, progress: Callable[[int, int, str], Any] | None = None
+) -> tuple[Row, History]:
+    """Find the parameters of least loss. Host.
+
+    Into `out_dir` go `history.npz`, `history.png`, `best.json` and `best.toml`, the scene with the best values. A
+    killed search goes on from its checkpoint.
+
+    Raises:
+        InputError: a file is missing, a parameter or an objective is unknown, a start lies out of bounds.
+        SimulationError: nothing that was tried could be simulated.
+    """
+    out, spec = _made(out_dir), study.tune
+    bounds = {name: _bounds(name, study) for name in study.parameters}
+    ends = [{name: end} for name, own in study.parameters.items() for end in (own.low, own.high) if end is not None]
+    trial, shared = _trial(study, ends, soft=spec.method == "adam")
+    start = {name: _start(name, study, shared[0]) for name in study.parameters}
+
+    def loss(values: Row, shared: Any) -> tuple[jax.Array, Scores]:
+        scores = trial(values, shared)
+        if "loss" not in scores:
+            raise SceneError(f"objective.function = {study.objective.function!r} gives no 'loss' to make small.")
+        return scores["loss"], scores
+
+    common: dict[str, Any] = {"bounds": bounds, "shared": shared}
+    if progress is not None:
+        total = spec.steps
+        common["callback"] = lambda step: progress(step.step, total, f"loss {step.loss:.4g}")
+    if spec.method == "adam":
+        best, history = fit(
+            loss, start, spec.rate, steps=spec.steps, clip=spec.clip, patience=spec.patience,
+            restarts=spec.restarts, has_aux=True, checkpoint=out / "fit.ckpt", **common,
+        )  # fmt: skip
+    else:
+        best, history = search(
+            lambda values, shared: loss(values, shared)[0], start, evaluations=spec.steps,
+            seed=spec.seed, checkpoint=out / "search.ckpt", **common,
+        )  # fmt: skip
+    history.save(out / "history.npz")
+    history.plot(out / "history.png")
+    _leave_best(study, best, out)
+    return best, history
+
+
+def _trial(study: Study, rows: Sequence[Row], *, soft: bool) -> tuple[Callable[..., Scores], tuple[Any, ...]]:
+    """Scores of parameters as a pure function of them and of what all share."""
+    scene = study.to_scene()
+    of_votes = [name.startswith("segmentation.") for name in study.parameters]
+    if all(of_votes):
+        temperature = study.objective.options.get("temperature", _SOFT_VOTES if soft else None)
+        if study.objective.function != "votes":
+            raise SceneError("objective.function: thresholds of the vote are scored by 'votes'.")
+        return lambda values, shared: shared[0].with_parameters(values).scores(), (
+            voting(scene, temperature=temperature),
+        )
+    if any(of_votes):
+        raise SceneError("parameters: thresholds of the vote decide what is simulated: study them apart from the rest.")
+    made = experiment(scene, extremes=_ends(study, rows), regions=study.regions, alone=study.only is not None)
+    for name in study.parameters:
+        made.value(name)  # unknown names are told before anything is compiled
+    objective = objective_of(study.objective.function, study.objective.options, Path(study.folder))
+    only_drawn = all(name.startswith("clamp.") for name in study.parameters)
+    outcome = jax.jit(Experiment.simulate)(made) if only_drawn else None
+    return partial(_score, objective), (made, outcome)
+
+
+def _score(objective: Objective, values: Row, shared: tuple[Experiment, Outcome | None]) -> Scores:
+    made, outcome = shared
+    changed = made.with_parameters(values)
+    return objective(changed.simulate() if outcome is None else outcome._replace(experiment=changed))
+
+
+def _rows(study: Study) -> list[Row]:
+    columns = {name: spec.swept(name) for name, spec in study.parameters.items()}
+    if study.sweep.join == "rows":
+        lengths = {name: len(values) for name, values in columns.items()}
+        if len(set(lengths.values())) > 1:
+            raise SceneError(f"parameters: rows are joined one by one, but there are {lengths} values.")
+        return [dict(zip(columns, row)) for row in zip(*columns.values())]
+    return [dict(zip(columns, row)) for row in itertools.product(*columns.values())]
+
+
+def _ends(study: Study, rows: Sequence[Row]) -> list[Row]:
+    """For each parameter the least and the greatest that it gets, all others as in the scene."""
+    ends: list[Row] = []
+    for name in study.parameters:
+        values = [row[name] for row in rows if name in row]
+        if values and not name.startswith("clamp."):
+            ordered = sorted(values, key=lambda value: float(np.linalg.norm(value)))
+            ends += [{name: ordered[0]}, {name: ordered[-1]}]
+    return ends
+
+
+def _check(made: Experiment | Voting, row: Row) -> None:
+    if isinstance(made, Experiment):
+        made.with_parameters(row).check()
+
+
+def _bounds(name: str, study: Study) -> Bounds | None:
+    spec = study.parameters[name]
+    if spec.low is None and spec.high is None and spec.scale == "linear":
+        return None
+    return Bounds(spec.low, spec.high, scale=spec.scale)
+
+
+def _start(name: str, study: Study, made: Experiment | Voting) -> jax.Array:
+    own: Value | None = study.parameters[name].start
+    present = made.value(name)
+    return present if own is None else jnp.broadcast_to(jnp.asarray(own, present.dtype), present.shape)
+
+
+def _leave_best(study: Study, best: Row, out: Path) -> None:
+    # as many digits as the numbers have
+    plain = {
+        name: jax.tree.map(lambda v: float(f"{v:.7g}"), np.asarray(value).tolist()) for name, value in best.items()
+    }
+    io.write_json(out / "best.json", plain)
+    (out / "best.toml").write_text(tomli_w.dumps(study.scene_values(plain, out)))
+
+
+def _draw(study: Study, table: Table, path: Path) -> None:
+    scalars = [name for name in study.parameters if np.ndim(study.parameters[name].swept(name)[0]) == 0]
+    if len(scalars) == 2 and study.sweep.join == "grid":
+        table.heat_map(path, scalars[0], scalars[1], study.sweep.of, mode=study.sweep.best)
+    elif len(scalars) == 1:
+        table.curve(path, scalars[0], study.sweep.of)
+
+
+def _made(out_dir: str | Path) -> Path:
+    out = Path(out_dir)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be made: {error.strerror}.") from None
+    return out

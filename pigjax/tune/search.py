@@ -1,0 +1,158 @@
+"""Search without gradients, for losses whose gradients say nothing: covariance matrix adaptation (`cma`)."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pigjax.errors import InputError, SimulationError
+from pigjax.tune.fit import flat_parameters
+from pigjax.tune.history import History, Recorder, Step
+
+_SPREAD = 0.5  # of the first candidates, in the unconstrained numbers
+
+
+def search(
+    loss: Callable[..., Any],
+    params: Any,
+    *,
+    evaluations: int,
+    bounds: Any = None,
+    shared: Any = None,
+    spread: float = _SPREAD,
+    population: int | None = None,
+    vectorize: bool = True,
+    seed: int = 0,
+    checkpoint: str | os.PathLike[str] | None = None,
+    callback: Callable[[Step], Any] | None = None,
+) -> tuple[Any, History]:
+    """Make a loss small without gradients, by CMA-ES (Hansen 2016, arXiv 1604.00772). Host.
+
+    A generation of candidates is evaluated at once by `vmap`. Candidates whose loss is not finite count as worse than
+    all others.
+
+    Args:
+        loss: of the parameters, or of them and `shared`.
+        params: where the search begins, a pytree of real arrays.
+        evaluations: most losses computed, rounded up to whole generations.
+        bounds: as in `fit`.
+        shared: as in `fit`.
+        spread: standard deviation of the first candidates, in the unconstrained numbers behind the bounds.
+        population: candidates of a generation; None: 4 + 3 ln(numbers sought).
+        vectorize: False calls the loss candidate by candidate outside of jit; what it raises for bad input or a broken
+            simulation counts as not finite.
+        seed: of the candidates.
+        checkpoint: file that a killed search goes on from.
+        callback: told the best candidate of each generation; True stops the search.
+
+    Returns:
+        The best parameters met, and the history of all candidates.
+
+    Raises:
+        InputError: `cma` is missing, a start on or beyond its bounds, or the checkpoint of another search.
+        SimulationError: no candidate had a finite loss.
+    """
+    try:
+        import cma
+    except ImportError:
+        raise InputError("a search without gradients needs cma: pip install 'pigjax[search]'.") from None
+    names, leaves, limits, rebuild = flat_parameters(params, bounds)
+    free = [np.asarray(limit.to_free(leaf), float) for limit, leaf in zip(limits, leaves)]
+    start = np.concatenate([leaf.ravel() for leaf in free])
+    splits = np.cumsum([leaf.size for leaf in free])[:-1]
+
+    def values_of(vector):
+        parts = jnp.split(vector, splits) if len(free) > 1 else [vector]
+        shaped = (part.reshape(leaf.shape) for part, leaf in zip(parts, leaves))
+        return [limit.from_free(leaf) for limit, leaf in zip(limits, shaped)]
+
+    def one(vector, shared):
+        values = values_of(vector)
+        return (loss(rebuild(values)) if shared is None else loss(rebuild(values), shared)), values
+
+    many = jax.jit(jax.vmap(one, (0, None))) if vectorize else None
+    options: dict[str, Any] = {"seed": seed + 1, "verbose": -9, "maxfevals": np.inf}
+    if population is not None:
+        options["popsize"] = population
+    # cma knows no single number: a second one, without any say, stands beside it
+    padded = start if len(start) > 1 else np.append(start, 0.0)
+    key = hashlib.sha256(np.append(padded, [evaluations, spread, seed]).tobytes()).hexdigest()[:16]
+    strategy, recorder, taken = cma.CMAEvolutionStrategy(padded, spread, options), None, 0
+    size = strategy.popsize
+    recorder = Recorder(names, [leaf.shape for leaf in leaves], -(-evaluations // size) * size)
+    if checkpoint is not None and Path(checkpoint).exists():
+        strategy, recorder, taken = _restored(Path(checkpoint), key)
+    stop = "steps"
+    while taken < evaluations:
+        candidates = strategy.ask()
+        vectors = jnp.asarray(np.stack(candidates)[:, : len(start)], leaves[0].dtype)
+        losses, values = many(vectors, shared) if many is not None else _one_by_one(one, vectors, shared)
+        losses = np.asarray(losses, float)
+        good = np.isfinite(losses)
+        steps = [
+            recorder.add(taken + k, losses[k], np.nan, [leaf[k] for leaf in values], bool(good[k])) for k in range(size)
+        ]
+        worst = losses[good].max() if good.any() else 0.0
+        strategy.tell(candidates, np.where(good, losses, worst + 1 + abs(worst)))
+        taken += size
+        if checkpoint is not None:
+            _save(Path(checkpoint), key, strategy, recorder, taken)
+        told = min(steps, key=lambda step: step.loss if step.good else np.inf)._replace(step=taken)
+        if callback is not None and callback(told) is True:
+            stop = "callback"
+            break
+        if strategy.stop():
+            stop = "plateau"
+            break
+    history = recorder.history(stop)
+    if not history.good.any():
+        raise SimulationError(f"none of {taken} candidates had a finite loss: start elsewhere, or narrow the bounds.")
+    at = int(np.argmin(np.where(history.good, history.loss, np.inf)))
+    best = [jnp.asarray(history.parameters[name][at], leaf.dtype) for name, leaf in zip(names, leaves)]
+    return rebuild(best), history
+
+
+def _one_by_one(one, vectors, shared):
+    losses, values = [], []
+    for vector in vectors:
+        try:
+            value, leaves = one(vector, shared)
+        except (InputError, SimulationError):
+            value, leaves = np.nan, None
+        losses.append(float(value))
+        values.append(leaves)
+    known = next((leaves for leaves in values if leaves is not None), None)
+    if known is None:
+        raise SimulationError("no candidate of the first generation could be evaluated: start elsewhere.")
+    blank = [np.full(np.shape(leaf), np.nan) for leaf in known]
+    return np.array(losses), [
+        np.stack([np.asarray(row[k]) for row in (v or blank for v in values)]) for k in range(len(known))
+    ]
+
+
+def _save(path: Path, key: str, strategy: Any, recorder: Recorder, taken: int) -> None:
+    import pickle
+
+    from pigjax.io.files import writing
+
+    with writing(path) as partial:
+        partial.write_bytes(pickle.dumps((key, strategy, recorder, taken)))
+
+
+def _restored(path: Path, key: str) -> tuple[Any, Recorder, int]:
+    import pickle
+
+    try:
+        found, strategy, recorder, taken = pickle.loads(path.read_bytes())
+    except (pickle.UnpicklingError, EOFError, ValueError, AttributeError, OSError) as error:
+        raise InputError(f"{path}: not a checkpoint of a search ({error}); delete it and run again.") from None
+    if found != key:
+        raise InputError(f"{path}: belongs to another search (start, bounds, evaluations or seed); delete it.")
+    return strategy, recorder, taken
