@@ -93,7 +93,7 @@ def fit(
             return out if has_aux else (out, {})
 
         (value, aux), gradient = jax.value_and_grad(of_free, has_aux=True)(free)
-        norm = optax.global_norm(gradient)
+        norm = optax.tree.norm(gradient)
         updates, optimiser = descent.update(gradient, optimiser, free)
         moved = optax.apply_updates(free, jax.tree.map(lambda update: rate * update, updates))
         return value, aux, norm, moved, optimiser
