@@ -360,7 +360,7 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 def _check_ids(masks, num_ids: int) -> None:
     if num_ids < 2:
         raise InputError(f"num_ids = {num_ids}: at least 2 are needed, the background and one object.")
-    high = int(np.max(masks)) if is_known(masks) else 0
+    high = int(np.asarray(masks).max()) if is_known(masks) else 0
     if high >= num_ids:
         raise InputError(
             f"masks hold the id {high}, num_ids = {num_ids}: raise num_ids to {high + 1}, or relabel (compact_ids)."

@@ -66,5 +66,5 @@ def check_masks(cameras: Camera, masks: Any) -> None:
         raise InputError(f"masks have shape {masks.shape}, the cameras ask for {expected} (views, height, width).")
     if not jnp.issubdtype(masks.dtype, jnp.integer):
         raise InputError(f"masks have type {masks.dtype}: integer ids are needed.")
-    if is_known(masks) and int(np.min(masks)) < 0:
-        raise InputError(f"masks hold the id {int(np.min(masks))}: ids start at 0, the background.")
+    if is_known(masks) and np.asarray(masks).min() < 0:
+        raise InputError(f"masks hold the id {np.asarray(masks).min()}: ids start at 0, the background.")

@@ -123,13 +123,7 @@ class Experiment(eqx.Module):
         Raises:
             InputError: a number is out of range, or waves or viscosity need a shorter step.
         """
-        names = {row: name for name, rows in self.rows for row in rows}
-        for row, law in enumerate(self.table.laws):
-            numbers = {field: getattr(self.table, field)[row] for field in _NUMBERS}
-            try:
-                Material(model=law, **numbers)
-            except InputError as error:
-                raise SceneError(f"objects.{names[row]}.{error}") from None
+        self._check_materials()
         speed = jnp.linalg.norm(self.particles.v, axis=-1).max()
         limit = stable_dt(self.table, self.grid, max_speed=speed, cfl=1.0, integrator=self.config.integrator)
         dt = float(self.frame_dt) / (self.config.substeps or 1)
@@ -170,6 +164,22 @@ class Experiment(eqx.Module):
         """All frames, one after the other so that memory is that of one."""
         picture = jax.checkpoint(partial(self.picture, trajectory))
         return lax.map(picture, jnp.arange(self.frames))
+
+    def _check_materials(self) -> None:
+        names = {row: name for name, rows in self.rows for row in rows}
+        for row, law in enumerate(self.table.laws):
+            numbers = {field: getattr(self.table, field)[row] for field in _NUMBERS}
+            try:
+                Material(model=law, **numbers)
+            except InputError as error:
+                raise SceneError(f"objects.{names[row]}.{error}") from None
+
+    def _is_possible(self) -> bool:
+        try:
+            self._check_materials()
+        except SceneError:
+            return False
+        return True
 
     def _split(self, name: str) -> tuple[str, str, str]:
         """Section, entry and field of a parameter's name."""
@@ -227,7 +237,8 @@ def experiment(
 
     Args:
         scene: as `load_scene` gives it.
-        extremes: parameters at the ends of a study, as `Experiment.with_parameters` takes them.
+        extremes: parameters at the ends of a study, as `Experiment.with_parameters` takes them; materials that cannot
+            be are passed over.
         regions: number of parts that an object is split into, by place, so that its numbers may differ from part to
             part; rows of the table, which cost nothing more.
         margin: room around the motion [m].
@@ -322,7 +333,7 @@ def _split_object(made: Experiment, name: str, count: int) -> Experiment:
 def _fitted(made: Experiment, dx: float, extremes: list[Mapping[str, Any]], margin: float) -> Experiment:
     """With substeps and a grid that serve all extremes."""
     near = fit_grid(made.particles.x, dx)
-    cases = [made.with_parameters(values) for values in extremes]
+    cases = [case for values in extremes if (case := made.with_parameters(values))._is_possible()]
 
     def steps(case: Experiment) -> dict[str, Any]:
         return {
