@@ -7,9 +7,9 @@ points.ids.npy), `--ply` reconstructions to score in part trained.
 """
 
 import argparse
-import re
 from pathlib import Path
 
+from _pages import replaced
 from _timing import machine
 from segmentation import association, comparison, memory, noise, sweep, trained, votes
 from segmentation.tabletop import EXAMPLE, load_tabletop
@@ -46,16 +46,6 @@ PARTS = {
     ),
     "memory": ("Memory of a large vote", lambda *_: f"{memory.HEADER}\n{memory.study()}"),
 }
-
-
-def replaced(page: str, title: str, text: str) -> str:
-    """The page with the tables of a section replaced; what stands before the section's first table or line stays."""
-    begin, end = f"<!-- {title}: printed -->", f"<!-- {title}: end -->"
-    section = f"{begin}\n\n{text}\n\n{end}"
-    pattern = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
-    if pattern.search(page):
-        return pattern.sub(lambda _: section, page)
-    return f"{page.rstrip()}\n\n## {title}\n\n{section}\n"
 
 
 def main():

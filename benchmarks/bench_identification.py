@@ -1,0 +1,236 @@
+"""System identification from video: python benchmarks/bench_identification.py [one two field other cost video]
+
+A known simulation of the tabletop is drawn, then stiffness and throw are recovered from the video alone, through the
+gradients of render ∘ clamp ∘ MLS-MPM. `--write docs/IDENTIFICATION.md` replaces the sections that were run.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from pathlib import Path
+
+from _pages import run_parts
+from _timing import measure, use_host_devices
+
+use_host_devices()
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import msgspec  # noqa: E402
+import numpy as np  # noqa: E402
+import optax  # noqa: E402
+
+from pigjax import io  # noqa: E402
+from pigjax.study import Experiment, experiment, load_study  # noqa: E402
+from pigjax.tune import Bounds, fit, search  # noqa: E402
+
+STUDIES = Path(__file__).parents[1] / "examples" / "studies"
+MEDIA = Path(__file__).parents[1] / "docs" / "media"
+STIFF = Bounds(1e3, 4e4, "log")
+SPEED = Bounds(-4.0, 4.0)
+STEPS = 80
+DUCK = {"objects.duck.young": 8e3, "objects.duck.velocity": [0.4, -0.3, -1.5]}
+DUCK_START = {"objects.duck.young": 3.2e4, "objects.duck.velocity": [0.38, -0.11, -1.05]}
+
+
+def made_from(study_name="duck_from_video.toml", *, only=None, overrides=None, **options) -> Experiment:
+    study = load_study(STUDIES / study_name)
+    study = msgspec.structs.replace(study, only=only or study.only, overrides={**study.overrides, **(overrides or {})})
+    return experiment(study.to_scene(), alone=True, **options)
+
+
+def arrays(values):
+    return {name: jnp.asarray(value, jnp.float32) for name, value in values.items()}
+
+
+@jax.jit
+def film(values, made):
+    outcome = made.with_parameters(values).simulate()
+    return outcome.experiment.video(outcome.trajectory)
+
+
+def loss(values, shared):
+    made, target = shared
+    return 1e3 * jnp.mean((film(values, made) - target) ** 2)
+
+
+def bounds_of(values):
+    return {name: SPEED if name.endswith("velocity") else STIFF for name in values}
+
+
+def descend(made, target, start, *, bounds=None, steps=STEPS, rate=0.1):
+    """The fit, with a rate that falls to nothing."""
+    adam = optax.adam(optax.cosine_decay_schedule(rate, steps))
+    begun = time.perf_counter()
+    best, history = fit(
+        loss, arrays(start), adam, steps=steps, bounds=bounds or bounds_of(start), shared=(made, target)
+    )
+    return best, history, time.perf_counter() - begun
+
+
+def off(name, value, truth):
+    """Error [%]: of vectors, the length of the difference."""
+    value, truth = np.asarray(value, float), np.asarray(truth, float)
+    return 100 * np.linalg.norm(value - truth) / np.linalg.norm(truth)
+
+
+def report(truth, start, best, history, seconds):
+    print("| parameter | truth | start | found | error |\n|---|---|---|---|---|")
+    for name, value in truth.items():
+        shown = (
+            np.round(np.asarray(v, float), 4 if np.ndim(v) else 1).tolist() for v in (value, start[name], best[name])
+        )
+        print("| " + " | ".join((name, *map(str, shown), f"{off(name, best[name], value):.2f} %")) + " |")
+    each = float(np.median(np.diff(history.seconds)[3:]))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(
+        f"\nLoss {history.loss[0]:.3g} to {history.least:.2g} in {len(history)} gradients of {each:.2f} s,"
+        f" {seconds:.0f} s in all with compilation; peak memory of the process {peak:.1f} GB."
+    )
+
+
+def one() -> None:
+    made = made_from(extremes=[{"objects.duck.young": STIFF.high}])
+    target = film(arrays(DUCK), made)
+    best, history, seconds = descend(made, target, DUCK_START)
+    report(DUCK, DUCK_START, best, history, seconds)
+    history.plot(MEDIA / "identification_one.png")
+    rows = [np.asarray(film(arrays(values), made))[::2] for values in (DUCK, DUCK_START, best)]
+    sheet = io.contact_sheet([frame for row in rows for frame in row], columns=len(rows[0]))
+    io.write_image(MEDIA / "identification_frames.png", sheet)
+    print("\n![Truth, start and what was found, every second frame](media/identification_frames.png)")
+
+
+TWO = {
+    "objects.duck.young": 8e3, "objects.duck.velocity": [0.4, -0.3, -1.5],
+    "objects.soccerball.young": 1.6e4, "objects.soccerball.velocity": [-0.3, 0.3, -2.0],
+}  # fmt: skip
+TWO_START = {
+    "objects.duck.young": 2.4e4, "objects.duck.velocity": [0.3, -0.2, -1.1],
+    "objects.soccerball.young": 5e3, "objects.soccerball.velocity": [-0.2, 0.2, -1.5],
+}  # fmt: skip
+
+
+def two() -> None:
+    near = {"camera.target": [-0.03, -0.02, 0.36], "camera.radius": 0.7, "camera.width": 112}
+    made = made_from(
+        only=["table", "duck", "soccerball"], overrides=near, extremes=[{"objects.duck.young": STIFF.high}]
+    )
+    target = film(arrays(TWO), made)
+    best, history, seconds = descend(made, target, TWO_START)
+    report(TWO, TWO_START, best, history, seconds)
+
+
+def field() -> None:
+    parts = 3
+    truth = {
+        "objects.duck.young": [6e3, 1.2e4, 2.4e4],
+        "objects.duck.density": [800.0, 1000.0, 1400.0],
+    }
+    start = {"objects.duck.young": [1.2e4] * parts, "objects.duck.density": [1000.0] * parts}
+    thrown = {"objects.duck.velocity": DUCK["objects.duck.velocity"]}
+    made = made_from(extremes=[{"objects.duck.young": STIFF.high}], regions={"duck": parts})
+    made = made.with_parameters(thrown)
+    target = film(arrays(truth), made)
+    bounds = {"objects.duck.young": STIFF, "objects.duck.density": Bounds(300.0, 3000.0, "log")}
+    best, history, seconds = descend(made, target, start, bounds=bounds, steps=120)
+    report(truth, start, best, history, seconds)
+    # what the video says of each combination: J'J of the frames by the logarithms of the parameters
+    names = list(truth)
+
+    def frames(logs):
+        return film({name: jnp.exp(logs[k * parts : (k + 1) * parts]) for k, name in enumerate(names)}, made)
+
+    logs = jnp.log(jnp.concatenate([arrays(truth)[name] for name in names]))
+    columns = []
+    for k in range(len(logs)):
+        nudge = 0.02 * jax.nn.one_hot(k, len(logs))
+        columns.append(np.asarray(frames(logs + nudge) - frames(logs - nudge)).ravel() / 0.04)
+    weight, axes = np.linalg.eigh(np.array(columns) @ np.array(columns).T)
+    print("\nWhat the video says of directions in the logarithms of E and ρ of the parts, by the eigenvalues of JᵀJ:\n")
+    print("| eigenvalue, of the largest | direction |\n|---|---|")
+    for value, axis in zip(weight[::-1], axes.T[::-1]):
+        print(f"| {value / weight[-1]:.1e} | {np.round(axis, 2).tolist()} |")
+    ratio, wanted = (np.asarray(own[names[0]]) / np.asarray(own[names[1]]) for own in (best, truth))
+    print(f"\nE/ρ of the parts is off by {np.round(100 * np.abs(ratio / wanted - 1), 1).tolist()} %.")
+
+
+def other() -> None:
+    print("| the video | E | v0 |\n|---|---|---|")
+    made = made_from(extremes=[{"objects.duck.young": STIFF.high}])
+    clean = film(arrays(DUCK), made)
+    rng = np.random.default_rng(0)
+    fine = {"simulation.dx": 0.0125}
+    videos = {
+        "same grid": clean,
+        "noise of 0.05 on every pixel": clean + jnp.asarray(0.05 * rng.normal(size=clean.shape), jnp.float32),
+        "other particles (seed 1)": film(arrays(DUCK), made_from(overrides={"simulation.seed": 1})),
+        "finer grid, dx 12.5 mm for 20 mm": film(arrays(DUCK), made_from(overrides=fine)),
+    }
+    for name, target in videos.items():
+        best, _, _ = descend(made, target, DUCK_START)
+        errors = [f"{off(key, best[key], DUCK[key]):.2f} %" for key in DUCK]
+        print(f"| {name} | {errors[0]} | {errors[1]} |", flush=True)
+
+
+def cost() -> None:
+    made = made_from(extremes=[{"objects.duck.young": STIFF.high}])
+    target = film(arrays(DUCK), made)
+    start, shared = arrays(DUCK_START), (made, target)
+    forward = jax.jit(loss)
+    _, once, _ = measure(loss, start, shared)
+    _, both, _ = measure(jax.value_and_grad(loss), start, shared)
+    limits = bounds_of(start)
+    names = sorted(start)
+
+    def of_free(vector):
+        free = {names[0]: vector[:3], names[1]: vector[3]} if names[0].endswith("velocity") else None
+        assert free is not None
+        return forward({name: limits[name].from_free(free[name]) for name in names}, shared)
+
+    at = jnp.concatenate([jnp.ravel(limits[name].to_free(start[name])) for name in names])
+    exact = jax.grad(lambda v: of_free(v))(at)
+    print("| way | in forward passes | angle to the exact gradient |\n|---|---|---|")
+    print(f"| reverse mode | {both / once:.1f} | 0 |")
+    for h in (1e-1, 1e-2, 1e-3):
+        central = jnp.stack([(of_free(at + h * e) - of_free(at - h * e)) / (2 * h) for e in jnp.eye(4)])
+        cosine = float(central @ exact / jnp.linalg.norm(central) / jnp.linalg.norm(exact))
+        print(f"| central differences, h = {h:g} | {2 * len(at)} | {np.degrees(np.arccos(min(cosine, 1.0))):.2f}° |")
+    print(f"\nA forward pass takes {once:.2f} s, forward and backward {both:.2f} s.\n")
+    print("| way | losses | gradients | s | E | v0 |\n|---|---|---|---|---|---|")
+    best, history, seconds = descend(made, target, DUCK_START)
+    print(f"| Adam | 0 | {len(history)} | {seconds:.0f} | " + errors_of(best))
+    for evaluations in (160, 480):
+        begun = time.perf_counter()
+        best, history = search(loss, start, evaluations=evaluations, bounds=limits, shared=shared)
+        print(f"| CMA-ES | {len(history)} | 0 | {time.perf_counter() - begun:.0f} | " + errors_of(best), flush=True)
+
+
+def errors_of(best) -> str:
+    return " | ".join(f"{off(name, best[name], DUCK[name]):.2f} %" for name in DUCK) + " |"
+
+
+def video() -> None:
+    """Write the frames that examples/studies/duck_from_video.toml looks for."""
+    made = made_from(extremes=[{"objects.duck.young": STIFF.high}])
+    frames = np.asarray(film(arrays(DUCK), made))
+    for number, frame in enumerate(frames):
+        io.write_image(STUDIES / "duck_video" / f"{number:02d}.png", np.clip(frame, 0, 1))
+    print(f"{len(frames)} frames in examples/studies/duck_video")
+
+
+PARTS = {
+    "one": ("One duck: stiffness and throw", one),
+    "two": ("Two objects of different stiffness", two),
+    "field": ("A field: stiffness and density of three parts", field),
+    "other": ("A video that the model did not draw", other),
+    "cost": ("What a gradient costs", cost),
+}
+
+if __name__ == "__main__":
+    if sys.argv[1:] == ["video"]:
+        video()
+    else:
+        run_parts("bench_identification.py", "System identification from video", PARTS, __doc__)
