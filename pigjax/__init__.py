@@ -36,6 +36,8 @@ from pigjax.segmentation import Labels, fill_unseen, lift_masks, object_mask
 from pigjax.sleep import Sleep
 from pigjax.solids import collider_from_gaussians
 from pigjax.splat import Frame, Gaussians, RenderConfig, Splats, render, required_capacity, surface_depth
+from pigjax.study import Experiment, experiment, load_study, sweep_study, tune_study
+from pigjax.tune import Bounds, Table, fit, load_table, search, sweep
 
 __version__ = "0.1.0"
 
@@ -43,11 +45,13 @@ __version__ = "0.1.0"
 __all__ = [
     "Association",
     "BodyContact",
+    "Bounds",
     "Box",
     "Camera",
     "Capsule",
     "ClampParams",
     "Cylinder",
+    "Experiment",
     "FitConfig",
     "Frame",
     "Gaussians",
@@ -70,6 +74,7 @@ __all__ = [
     "Sleep",
     "Sphere",
     "Splats",
+    "Table",
     "Trajectory",
     "Views",
     "associate_masks",
@@ -84,8 +89,10 @@ __all__ = [
     "deform",
     "eigen_clamp",
     "evaluate_labels",
+    "experiment",
     "extract_object",
     "fill_unseen",
+    "fit",
     "fit_grid",
     "hole_mask",
     "interpolate_path",
@@ -96,6 +103,8 @@ __all__ = [
     "load_ply",
     "load_points",
     "load_scene",
+    "load_study",
+    "load_table",
     "load_views",
     "look_at",
     "make_particles",
@@ -113,12 +122,16 @@ __all__ = [
     "rollout",
     "run_scene",
     "save_ply",
+    "search",
     "seed_particles",
     "ssim",
     "stable_dt",
     "stack_cameras",
     "step",
     "surface_depth",
+    "sweep",
+    "sweep_study",
+    "tune_study",
     "vast_grid",
     "write_video",
 ]
