@@ -1,7 +1,7 @@
 """Speed against accuracy: `python benchmarks/bench_tradeoff.py [part ...] [--write docs/TRADEOFF.md]`.
 
 Parts: matter, drawing, voting, whole; without names all are run. Each knob is turned alone from the standard, on the
-bundled tabletop, a jelly cube and a sand column (`--scenes`). Times are medians of warm runs in turn, compilation
+bundled tabletop, a jelly cube and a cube of sand (`--scenes`). Times are medians of warm runs in turn, compilation
 apart. `--write` replaces the sections of those parts in the page, and their plots in docs/media.
 """
 
@@ -10,9 +10,6 @@ import re
 from pathlib import Path
 
 from _timing import machine, use_host_devices
-
-use_host_devices()
-
 from tradeoff import drawing, matter, voting, whole
 from tradeoff.scenes import SCENES
 
@@ -41,6 +38,7 @@ def main():
     parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=SCENES)
     parser.add_argument("--write", type=Path, help="page whose sections are replaced")
     options = parser.parse_args()
+    use_host_devices()
     for name in options.parts or PARTS:
         title, study = PARTS[name]
         scenes = "" if options.scenes == list(SCENES) else f" --scenes {' '.join(options.scenes)}"

@@ -143,7 +143,7 @@ def test_table_marks_the_pareto_set_fastest_first():
 def test_displacement_error_splits_into_centres_and_shape():
     rng = np.random.default_rng(0)
     rest, body = rng.normal(size=(40, 3)), np.repeat([1, 2], [10, 30])
-    reference = rest + [3.0, 0.0, 4.0]  # travelled 5
+    reference = rest + np.array([3.0, 0.0, 4.0])  # travelled 5
     moved = reference + np.where(body == 1, 0.2, -0.1)[:, None] * [1, 0, 0]
     error = displacement_error(moved, reference, rest, body)
     assert error.centre == pytest.approx(math.sqrt((10 * 0.2**2 + 30 * 0.1**2) / 40) / 5)

@@ -70,7 +70,8 @@ def _study(name):
     for key, (knob, _) in settings.items():
         if key != "reference":
             wrong = error(ends[key], ends["reference"])
-            note = f"centre {wrong.centre:.1e}, shape {wrong.shape:.1e}; {len(plans.get(key, plans['standard']).particles)} particles"
+            count_of = len(plans.get(key, plans["standard"]).particles)
+            note = f"centre {wrong.centre:.1e}, shape {wrong.shape:.1e}; {count_of} particles"
             points.append(Point(key, knob, timed[key].seconds, wrong.total, timed[key].compile_seconds, note))
     nudged, reseeded = _floors(of, scenes["standard"], plans["standard"], count)
     floor = error(reseeded, ends["standard"]).total

@@ -1,4 +1,4 @@
-"""The scenes: the bundled tabletop, a jelly cube and a sand column made here, and their way to pictures, stage by stage."""
+"""The bundled tabletop, a jelly cube and a cube of sand made here, and their way to pictures, stage by stage."""
 
 import tempfile
 import tomllib

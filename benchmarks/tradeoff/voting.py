@@ -5,10 +5,10 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from segmentation.tabletop import load_tabletop
 
 from pigjax.segmentation import enough_capacity, lift_masks
 from pigjax.splat import RenderConfig
-from segmentation.tabletop import load_tabletop
 from tradeoff.errors import share_right
 from tradeoff.points import Point, in_turn, plot, table
 
@@ -58,9 +58,9 @@ def _vote(scene, every, size, start=0, **options):
     gaussians = scene.gaussians
     config = enough_capacity(gaussians, cameras, RenderConfig())
     vote = jax.jit(
-        lambda gaussians, cameras: lift_masks(
-            gaussians, cameras, masks, num_ids=scene.num_ids, config=config, **options
-        ).object_id
+        lambda gaussians, cameras: (
+            lift_masks(gaussians, cameras, masks, num_ids=scene.num_ids, config=config, **options).object_id
+        )
     )
     return lambda: vote(gaussians, cameras)
 

@@ -312,7 +312,8 @@ def _check(scene: Scene, where: str) -> None:
     for name, value in positive.items():
         if not 0 < value < float("inf"):
             raise SceneError(f"{where}: {name} = {value}: it must be > 0.")
-    for name, low in {"alpha_min": scene.drawing.alpha_min, "transmittance_min": scene.drawing.transmittance_min}.items():
+    for name in ("alpha_min", "transmittance_min"):
+        low = getattr(scene.drawing, name)
         if not 0 <= low < 1:
             raise SceneError(f"{where}: drawing.{name} = {low}: it must lie in [0, 1).")
     if scene.drawing.sh_degree not in (None, 0, 1, 2, 3):
