@@ -1,0 +1,142 @@
+"""Control through contact: python benchmarks/bench_control.py [throw miss cost]
+
+The throw of a ball is sought that knocks a cube off the table (examples/studies/knock_off.toml), by the gradients of
+MLS-MPM through the contact on the grid, and without gradients. `--write docs/CONTROL.md` replaces the sections that
+were run.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+from _pages import run_parts
+from _timing import measure, use_host_devices
+
+use_host_devices()
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+
+from pigjax import io  # noqa: E402
+from pigjax.study import experiment, load_study  # noqa: E402
+from pigjax.study.objectives import objective_of  # noqa: E402
+from pigjax.tune import Bounds, fit, search  # noqa: E402
+
+STUDIES = Path(__file__).parents[1] / "examples" / "studies"
+MEDIA = Path(__file__).parents[1] / "docs" / "media"
+THROW = "objects.soccerball.velocity"
+EDGE = -0.39  # of the table [m]
+OFF = EDGE - 0.02  # a middle of the cube that is off [m]
+WANTED = -0.5  # what the objective asks of it [m]
+WEAK = [0.1, -1.2, 0.3]  # reaches the cube and leaves it on the table
+WIDE = [-0.8, -1.6, 0.2]  # passes it
+STEPS, EVALUATIONS = 40, 112
+HEADER = "| throw | velocity [m/s] | cube at the end: y [m] | z [m] | off |\n|---|---|---|---|---|"
+
+
+@cache
+def prepared():
+    """Experiment, and bounds of the throw."""
+    study = load_study(STUDIES / "knock_off.toml")
+    throw = study.parameters[THROW]
+    made = experiment(study.to_scene(), alone=True, extremes=[{THROW: throw.low}, {THROW: throw.high}])
+    return made, {THROW: Bounds(throw.low, throw.high)}
+
+
+@cache
+def objective():
+    return objective_of("knock_off.py:objective", {}, STUDIES)
+
+
+def loss(values, shared):
+    """Of a throw; `approach` is the weight of the nearest pass."""
+    made, approach = shared
+    scores = objective()(made.with_parameters(values).simulate(), approach=approach)
+    return scores["loss"], scores
+
+
+def start_of(velocity):
+    return {THROW: jnp.asarray(velocity, jnp.float32)}
+
+
+@jax.jit
+def ending(values, made):
+    outcome = made.with_parameters(values).simulate()
+    return objective()(outcome), outcome.experiment.video(outcome.trajectory)
+
+
+def row(name, values):
+    """A line of the table; gives the frames."""
+    where, frames = ending(values, prepared()[0])
+    y, z = float(where["y"]), float(where["z"])
+    velocity = ", ".join(f"{v:.2f}" for v in np.asarray(values[THROW]))
+    print(f"| {name} | {velocity} | {y:.3f} | {z:.3f} | {'yes' if y < OFF else 'no'} |")
+    return np.asarray(frames)
+
+
+def descend(velocity):
+    """Adam until the cube is off."""
+    made, bounds = prepared()
+    return fit(
+        loss, start_of(velocity), 0.15, steps=STEPS, bounds=bounds, shared=(made, jnp.asarray(0.3)), has_aux=True,
+        callback=lambda step: step.scores["y"] < OFF,
+    )  # fmt: skip
+
+
+def throw() -> None:
+    start = start_of(WEAK)
+    best, history = descend(WEAK)
+    print(f"The table's edge is at y = {EDGE} m. Descent stops at the first throw that pushes the cube past it.\n")
+    print(HEADER)
+    rows = [row("start", start), row("found", best)]
+    print(f"\nLoss {history.loss[0]:.3g} to {history.least:.2g} m² in {len(history)} gradients.")
+    frames = [frame for frames in rows for frame in frames[1::2]]
+    io.write_image(MEDIA / "control_throw.png", io.contact_sheet(frames, columns=len(frames) // 2))
+    print("\n![Above the start, below what was found, every second frame](media/control_throw.png)")
+
+
+def miss() -> None:
+    made, _ = prepared()
+    slope = jax.jit(lambda values, shared: jax.grad(loss, has_aux=True)(values, shared)[0])
+    for name, velocity in (("touches the cube", WEAK), ("misses it", WIDE)):
+        steep = [float(jnp.linalg.norm(slope(start_of(velocity), (made, jnp.asarray(a)))[THROW])) for a in (0.0, 0.3)]
+        print(f"Slope [m²/(m/s)] at a throw that {name}: {steep[0]:.1e} alone, {steep[1]:.1e} with the nearest pass.\n")
+    best, history = descend(WIDE)
+    print(HEADER)
+    row("start", start_of(WIDE))
+    row("found, with the pass", best)
+    print(f"\n{len(history)} gradients.")
+
+
+def cost() -> None:
+    made, bounds = prepared()
+    shared = made, jnp.asarray(0.3)
+    _, once, _ = measure(loss, start_of(WEAK), shared, repeats=3)
+    print(f"One loss takes {once:.2f} s. Until the cube is off, each after its first call, which compiles:\n")
+    print("| start | way | losses | gradients | s | off |\n|---|---|---|---|---|---|")
+    for name, velocity in (("touches the cube", WEAK), ("misses it", WIDE)):
+        _, history = descend(velocity)
+        off = "yes" if history.scores["y"][-1] < OFF else "no"
+        each = float(np.median(np.diff(history.seconds)))
+        print(f"| {name} | Adam | 0 | {len(history)} | {len(history) * each:.0f} | {off} |")
+        _, history = search(
+            lambda values, shared: loss(values, shared)[0], start_of(velocity), evaluations=EVALUATIONS, bounds=bounds,
+            shared=shared, callback=lambda step: step.loss < (OFF - WANTED) ** 2,
+        )  # fmt: skip
+        off = "yes" if history.least < (OFF - WANTED) ** 2 else "no"
+        spans = np.diff(history.seconds)
+        each = float(np.median(spans[spans > 0.05])) if (spans > 0.05).any() else float("nan")
+        population = 7
+        print(f"| {name} | CMA-ES | {len(history)} | 0 | {len(history) / population * each:.0f} | {off} |")
+
+
+PARTS = {
+    "throw": ("A throw that knocks the cube off", throw),
+    "miss": ("From a throw that misses", miss),
+    "cost": ("What it costs, beside a search without gradients", cost),
+}
+
+if __name__ == "__main__":
+    run_parts("bench_control.py", "Control through contact", PARTS, __doc__)
