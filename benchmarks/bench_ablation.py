@@ -1,239 +1,179 @@
-"""Ablation of the clamp: python benchmarks/bench_ablation.py [modes sweep] [--write docs/ABLATION.md]
+"""The clamp's ablation: `python benchmarks/bench_ablation.py [bent pressed drawn] [--write docs/ABLATION.md]`.
 
-Three objects of the bundled tabletop under small, large and extreme deformation, posed in the four modes of
-`eigen_clamp` and compared with the same deformation of a splat set so dense that no splat is large
-(`ablation/dense.py`).
+The modes of `eigen_clamp` on three objects that deform little, much and extremely, beside a truth made of many small
+parts (`ablation.reference`); then sweeps of lambda_R × lambda_S and of tau_max × tau_min for "aligned". `--write`
+replaces the scenes' sections of the page, and their pictures in docs/media.
 """
 
-from __future__ import annotations
-
-import functools
+import argparse
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from _pages import run_parts
-from _timing import measure, use_host_devices
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _pages import replaced
+from _timing import machine, measure
+from ablation.pictures import write_heat, write_row
+from ablation.reference import EXACT, render_parts, split
+from ablation.scenes import Subject, subjects
+from ablation.scores import ASPECT, GROWTH, SHARE, image_scores, needles
 
-use_host_devices()
+import pigjax as pj
+from pigjax.splat import as_splats
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import matplotlib  # noqa: E402
-import numpy as np  # noqa: E402
-from ablation.dense import carried, split  # noqa: E402
-from ablation.scores import holes, needles  # noqa: E402
-
-import pigjax as pj  # noqa: E402
-from pigjax import io  # noqa: E402
-from pigjax.clamp import ClampParams, eigen_clamp  # noqa: E402
-
-matplotlib.use("Agg")
-EXAMPLE = Path(__file__).parents[1] / "examples" / "tabletop"
-MEDIA = Path(__file__).parents[1] / "docs" / "media"
+MEDIA = Path(__file__).parents[1] / "docs/media"
 MODES = ("fixed", "covariance", "literal", "aligned")
-SPACING = 4e-3  # of the dense set [m]
-SIZE, VIEWS = 200, 3
+LAMBDAS = np.linspace(0, 1.5, 9)
+TAU_MAX, TAU_MIN = np.geomspace(1, 8, 7), np.geomspace(0.125, 1, 7)
 
 
 class Case(NamedTuple):
-    """An object, how its matter went, and what the truth looks like from a few cameras."""
+    """A subject after its deformation, and its truth."""
 
-    name: str
-    gaussians: pj.Gaussians  # at their places after the deformation, of shapes at rest
-    F: jax.Array  # at each
-    cameras: pj.Camera
-    truth: list[np.ndarray]  # rgb
-    coverage: list[np.ndarray]  # alpha
-    floor: float  # PSNR of the dense set against the object, both at rest [dB]
-
-
-@functools.cache
-def tabletop():
-    gaussians = pj.load_ply(EXAMPLE / "tabletop.ply")
-    views = pj.load_views(EXAMPLE, masks=True, split="train")
-    labels = pj.lift_masks(gaussians, views.cameras, views.masks, num_ids=8)
-    return gaussians, np.asarray(labels.object_id)
+    gaussians: pj.Gaussians  # at rest shape, where matter went
+    rest: pj.Gaussians
+    F: jax.Array
+    camera: pj.Camera
+    truth: pj.Frame
+    coarse: pj.Frame  # truth of parts twice as large
+    floor: dict  # scores at rest, order "gaussians"; and the PSNR where parts sort by their own depth
+    counts: tuple[int, int]  # parts, coarse and fine
 
 
-def object_of(number: int) -> pj.Gaussians:
-    gaussians, ids = tabletop()
-    return jax.tree.map(lambda column: column[ids == number], gaussians)
+def prepare(subject: Subject, pixels: int) -> Case:
+    """Deform a subject and draw its references. One call of the field moves all."""
+    rest = subject.gaussians
+    levels = [split(rest, size) for size in (2 * subject.size, subject.size)]
+    places = [np.asarray(rest.means), *(parts.positions(rest) for parts in levels)]
+    x, F = subject.field(np.concatenate(places))
+    ends = np.cumsum([len(p) for p in places])[:-1]
+    xs, Fs = np.split(x, ends), np.split(F, ends)
+    camera, rest_camera = subject.camera(xs[0], pixels), subject.camera(places[0], pixels)
+    coarse, truth = (render_parts(rest, parts, *moved, xs[0], camera) for parts, *moved in zip(levels, xs[1:], Fs[1:]))
+    still = jnp.broadcast_to(jnp.eye(3), Fs[2].shape)
+    at_rest = pj.render(rest, rest_camera, EXACT, background=1.0)
+    again = partial(render_parts, rest, levels[1], places[2], still, places[0], rest_camera)
+    floor = {k: float(v) for k, v in image_scores(again(), at_rest).items()}
+    floor["own order"] = float(image_scores(again(order="parts"), at_rest)["psnr"])
+    moved = eqx.tree_at(lambda g: g.means, rest, jnp.asarray(xs[0]))
+    counts = len(levels[0].parent), len(levels[1].parent)
+    return Case(moved, rest, jnp.asarray(Fs[0]), camera, truth, coarse, floor, counts)
 
 
-def moved(number: int, material: pj.Material, velocity, frames: int, colliders=()):
-    """An object's particles at rest, after a simulation, and their deformation."""
-    own = object_of(number)
-    labels = np.full(len(own), number)
-    particles, table = pj.seed_particles(own, labels, {number: material}, spacing=0.008, velocities={number: velocity})
-    grid = pj.vast_grid(0.008)
-    end, _, health = pj.rollout(
-        particles,
-        grid,
-        table,
-        pj.SimConfig(),
-        frames=frames,
-        frame_dt=1 / 96,
-        gravity=(0.0, 0.0, -9.81),
-        colliders=colliders,
-    )
-    health.raise_if_bad()
-    return np.asarray(particles.x, float), np.asarray(end.x, float), np.asarray(end.F_visual, float)
+def study(subject: Subject, pixels: int, media: Path | None) -> str:
+    """Tables of one subject as Markdown."""
+    case = prepare(subject, pixels)
+    stretch = np.linalg.svd(np.asarray(case.F), compute_uv=False)
+    strain = f"{np.percentile(stretch, 1):.2f} to {np.percentile(stretch, 99):.2f}"
+    lines = [
+        f"{subject.told}: {len(case.rest)} Gaussians, stretches {strain} (1st to 99th percentile), {pixels}² px.",
+        f"Reference: {case.counts[1]} parts of at most {1e3 * subject.size:g} mm. At rest they give the original's"
+        f" image to {case.floor['psnr']:.1f} dB, SSIM {case.floor['ssim']:.4f}: the floor of all scores"
+        f" ({case.floor['own order']:.1f} dB where each part is sorted by its own depth). `PSNR/2` is scored"
+        f" against {case.counts[0]} parts of twice the size; the two references agree to"
+        f" {float(image_scores(case.coarse, case.truth)['psnr']):.1f} dB.",
+        "",
+        f"| mode | PSNR | SSIM | PSNR/2 | holes % | spill % | aspect > {ASPECT:g} % | grown > {GROWTH:g}x %"
+        f" | larger than {100 * SHARE:g} % of object % | ms/frame |",
+        "|" + "---|" * 10,
+    ]
+    images = {"reference": case.truth}
+    for mode in MODES:
+        row, images[mode] = row_of(case, mode)
+        lines.append(row)
+    lines += ["", *sweeps(subject, case, media)]
+    if media:
+        write_row(media / f"ablation_{subject.name}.png", images)
+        lines += ["", f"![reference and modes](media/ablation_{subject.name}.png)"]
+    return "\n".join(lines)
 
 
-def twisted(points: np.ndarray, middle: np.ndarray, *, turn: float, stretch: float):
-    """A closed form: turned about the vertical by `turn` radians a metre, and stretched along it."""
-    local = points - middle
-    angle = turn * local[:, 2]
-    c, s = np.cos(angle), np.sin(angle)
-    thin = stretch**-0.5
-    x, y = thin * (c * local[:, 0] - s * local[:, 1]), thin * (s * local[:, 0] + c * local[:, 1])
-    F = np.zeros((len(points), 3, 3))
-    F[:, 0, 0], F[:, 0, 1], F[:, 0, 2] = thin * c, -thin * s, -turn * y
-    F[:, 1, 0], F[:, 1, 1], F[:, 1, 2] = thin * s, thin * c, turn * x
-    F[:, 2, 2] = stretch
-    return middle + np.stack([x, y, stretch * local[:, 2]], -1), F
+def row_of(case: Case, mode: str) -> tuple[str, pj.Frame]:
+    """One line of the table, and its image."""
+    splats = pj.eigen_clamp(case.gaussians, case.F, pj.ClampParams(), mode=mode)
+    frame = pj.render(splats, case.camera, EXACT, background=1.0)
+    ours, half = image_scores(frame, case.truth), image_scores(frame, case.coarse)
+    shares = needles(splats, as_splats(case.rest))
+
+    def draw(gaussians, F):  # as users draw: the default settings
+        return pj.render(pj.eigen_clamp(gaussians, F, pj.ClampParams(), mode=mode), case.camera, background=1.0).rgb
+
+    _, seconds, _ = measure(draw, case.gaussians, case.F, repeats=5, seconds=3.0)
+    percents = " | ".join(f"{100 * float(v):.2f}" for v in (ours["holes"], ours["spill"], *(shares[k] for k in shares)))
+    scores = f"{float(ours['psnr']):.2f} | {float(ours['ssim']):.4f} | {float(half['psnr']):.2f}"
+    return f"| {mode} | {scores} | {percents} | {1e3 * seconds:.1f} |", frame
 
 
-def field_of(name: str):
-    """Number of the object and its deformation: points at rest to places and gradients."""
-    floor = pj.Plane(point=(0.0, 0.0, 0.325), normal=(0.0, 0.0, 1.0), friction=0.5)
-    if name == "pressed duck":
-        rest, x, F = moved(2, pj.preset("jelly"), (0.3, 0.0, -1.2), 4, (floor,))
-        return 2, lambda points: carried(points, rest, x, F)
-    if name == "twisted ball":
-        middle = np.median(np.asarray(object_of(3).means, float), 0)
-        return 3, lambda points: twisted(points, middle, turn=25.0, stretch=1.8)
-    soft = pj.Material(
-        model="plasticine", density=1000.0, young=3e4, poisson=0.3, yield_stress=1.5e3, hardening_modulus=-1e3
-    )
-    rest, x, F = moved(5, soft, (1.0, 0.5, -2.2), 6, (floor,))
-    return 5, lambda points: carried(points, rest, x, F)
+@eqx.filter_jit
+def grid_scores(case: Case, params: pj.ClampParams) -> dict[str, jax.Array]:
+    """Scores of "aligned" at each of many parameters [k]."""
+
+    def one(p):
+        splats = pj.eigen_clamp(case.gaussians, case.F, p, mode="aligned")
+        return image_scores(pj.render(splats, case.camera, EXACT, background=1.0), case.truth)
+
+    return jax.lax.map(one, params)
 
 
-def drawn(splats, cameras):
-    draw = jax.jit(lambda s, camera: pj.render(s, camera, background=1.0, outputs=("rgb", "alpha")))
-    frames = [draw(splats, camera) for camera in cameras]
-    return [np.asarray(f.rgb) for f in frames], [np.asarray(f.alpha) for f in frames]
+def sweeps(subject: Subject, case: Case, media: Path | None) -> list[str]:
+    """Best of both sweeps beside the paper's numbers, and their heat maps."""
+    r, s = (v.ravel() for v in np.meshgrid(LAMBDAS, LAMBDAS, indexing="ij"))
+    high, low = (v.ravel() for v in np.meshgrid(TAU_MAX, TAU_MIN, indexing="ij"))
+    full = np.ones_like(r)
 
+    def params(tau_min, tau_max, lambda_R, lambda_S):
+        return pj.ClampParams(*(jnp.asarray(v, jnp.float32) for v in (tau_min, tau_max, lambda_R, lambda_S)))
 
-def mean_psnr(seen, truth) -> float:
-    return float(np.mean([pj.psnr(jnp.asarray(a), jnp.asarray(b)) for a, b in zip(seen, truth)]))
+    paper = grid_scores(case, params(*np.array([[0.5], [2.0], [1.2], [0.8]])))
+    by_lambda = grid_scores(case, params(0.5 * full, 2 * full, r, s))
+    best = int(np.argmax(by_lambda["psnr"]))
+    ones = np.ones_like(high)
+    by_tau = {
+        "paper's lambdas": grid_scores(case, params(low, high, 1.2 * ones, 0.8 * ones)),
+        "lambdas of 1": grid_scores(case, params(low, high, ones, ones)),
+    }
+    lines = ["| sweep of `aligned` | by | where | PSNR | SSIM | holes % | spill % |", "|" + "---|" * 7]
 
+    def line(title, by, where, scores, k):
+        psnr, ssim, holes, spill = (float(scores[name][k]) for name in ("psnr", "ssim", "holes", "spill"))
+        return f"| {title} | {by} | {where} | {psnr:.2f} | {ssim:.4f} | {100 * holes:.2f} | {100 * spill:.2f} |"
 
-@functools.cache
-def case(name: str, spacing: float = SPACING) -> Case:
-    number, deformation = field_of(name)
-    own = object_of(number)
-    dense, _ = split(own, spacing)
-    x, F = deformation(np.asarray(own.means, float))
-    dense_x, dense_F = deformation(np.asarray(dense.means, float))
-    middle, reach = np.median(x, 0), np.quantile(np.linalg.norm(x - np.median(x, 0), axis=1), 0.98)
-    cameras = pj.orbit(
-        middle, radius=4.2 * reach, elevation=0.45, frames=VIEWS, focal=1.5 * SIZE, width=SIZE, height=SIZE, start=0.4
-    )
-    moved_dense = pj.Gaussians(jnp.asarray(dense_x, jnp.float32), *jax.tree.leaves(dense)[1:])
-    # small enough that every mode but "fixed" draws the same
-    truth = eigen_clamp(moved_dense, jnp.asarray(dense_F, jnp.float32), ClampParams(), mode="covariance")
-    rgb, alpha = drawn(truth, cameras)
-    floor = mean_psnr(drawn(dense, cameras)[0], drawn(own, cameras)[0])
-    here = pj.Gaussians(jnp.asarray(x, jnp.float32), *jax.tree.leaves(own)[1:])
-    return Case(name, here, jnp.asarray(F, jnp.float32), cameras, rgb, alpha, floor)
-
-
-CASES = ("pressed duck", "twisted ball", "crushed brick")
-
-
-def modes() -> None:
-    print("| scene, σ of F (1, 50, 99 %) | mode | PSNR | SSIM | missing | spilt | aspect > 8 | longer than 2x | ms |")
-    print("|---|---|---|---|---|---|---|---|---|")
-    rows = []
-    for name in CASES:
-        scene = case(name)
-        spread = np.quantile(np.linalg.svd(np.asarray(scene.F))[1], [0.01, 0.5, 0.99])
-        pictures = [scene.truth[0]]
-        for mode in MODES:
-            pose = functools.partial(eigen_clamp, params=ClampParams(), mode=mode)
-            _, seconds, splats = measure(pose, scene.gaussians, scene.F)
-            rgb, alpha = drawn(splats, scene.cameras)
-            pictures.append(rgb[0])
-            lost = np.mean([holes(a, t) for a, t in zip(alpha, scene.coverage)], 0)
-            thin = needles(splats.factors, np.exp(scene.gaussians.log_scales))
-            likeness = np.mean([pj.ssim(jnp.asarray(a), jnp.asarray(b)) for a, b in zip(rgb, scene.truth)])
-            label = f"{name}, {spread[0]:.2f} {spread[1]:.2f} {spread[2]:.2f}" if mode == MODES[0] else ""
-            print(
-                f"| {label} | {mode} | {mean_psnr(rgb, scene.truth):.2f} | {likeness:.4f} | {lost[0]:.2%}"
-                f" | {lost[1]:.2%} | {thin[0]:.1%} | {thin[1]:.1%} | {1e3 * seconds:.2f} |"
-            )
-        rows.append(pictures)
-    io.write_image(MEDIA / "ablation.png", io.contact_sheet([p for row in rows for p in row], columns=5))
-    print("\n![Truth, then fixed, covariance, literal, aligned](media/ablation.png)\n")
-    print("| scene | splats | dense set | at rest, dense against splats | aligned against a denser truth (2.8 mm) |")
-    print("|---|---|---|---|---|")
-    for name in CASES:
-        scene, finer = case(name), case(name, 2.8e-3)
-        splats = eigen_clamp(scene.gaussians, scene.F, ClampParams())
-        again = mean_psnr(drawn(splats, finer.cameras)[0], finer.truth)
-        number = {"pressed duck": 2, "twisted ball": 3}.get(name, 5)
-        print(
-            f"| {name} | {len(scene.gaussians)} | {len(split(object_of(number), SPACING)[0])} | {scene.floor:.1f} dB |"
-            f" {again:.2f} dB |"
+    lines.append(line("paper", "-", "λR 1.2, λS 0.8, τ 0.5 to 2", paper, 0))
+    grids = [("λ, τ 0.5 to 2", by_lambda, lambda k: f"λR {r[k]:.2f}, λS {s[k]:.2f}")]
+    grids += [(f"τ, {name}", scores, lambda k: f"τ {low[k]:.3g} to {high[k]:.3g}") for name, scores in by_tau.items()]
+    for title, scores, where in grids:
+        wrong = scores["holes"] + scores["spill"]
+        tops = {"PSNR": scores["psnr"], "SSIM": scores["ssim"], "holes + spill": -wrong}
+        for by, values in tops.items():
+            k = int(np.argmax(values))
+            lines.append(line(title, by, where(k), scores, k))
+    if media:
+        write_heat(
+            media / f"ablation_{subject.name}_sweep.png",
+            (LAMBDAS, np.reshape(by_lambda["psnr"], (9, 9)), (r[best], s[best])),
+            (TAU_MAX, TAU_MIN, np.reshape(by_tau["lambdas of 1"]["psnr"], (7, 7))),
         )
+        lines += ["", f"![sweeps](media/ablation_{subject.name}_sweep.png)"]
+    return lines
 
 
-def sweep() -> None:
-    lambdas = np.linspace(0, 1.6, 9)
-    from matplotlib.figure import Figure
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="scene", help="bent, pressed, drawn; all if none is given")
+    parser.add_argument("--pixels", type=int, default=192)
+    parser.add_argument("--write", type=Path, help="page whose sections are replaced")
+    options = parser.parse_args()
+    for subject in subjects(tuple(options.names) or ("bent", "pressed", "drawn")):
+        command = f"`python benchmarks/bench_ablation.py {subject.name}`, {machine()}"
+        text = f"{command}\n\n{study(subject, options.pixels, MEDIA if options.write else None)}"
+        print(f"\n## {subject.name}\n\n{text}", flush=True)
+        if options.write:
+            page = options.write.read_text() if options.write.exists() else "# The clamp's ablation\n"
+            options.write.write_text(replaced(page, subject.name, text))
 
-    figure = Figure(figsize=(11, 3.4), layout="constrained")
-    panels = figure.subplots(1, len(CASES))
-    print("| scene | at the paper's 1.2, 0.8 | best lambda_R, lambda_S | there | best tau_max at 1, 1 | there |")
-    print("|---|---|---|---|---|---|")
-    for name, axes in zip(CASES, panels):
-        scene = case(name)
-        truth = jnp.asarray(np.stack(scene.truth))
-
-        def score(values, shared):
-            gaussians, F, cameras, truth = shared
-            params = ClampParams(
-                lambda_R=values["lambda_R"],
-                lambda_S=values["lambda_S"],
-                tau_max=values["tau_max"],
-                tau_min=1 / values["tau_max"],
-            )
-            splats = eigen_clamp(gaussians, F, params)
-            errors = [
-                jnp.mean((pj.render(splats, cameras[k], background=1.0, outputs=("rgb",)).rgb - truth[k]) ** 2)
-                for k in range(VIEWS)
-            ]
-            return {"psnr": jnp.mean(-10 * jnp.log10(jnp.stack(errors)))}
-
-        shared = (scene.gaussians, scene.F, scene.cameras, truth)
-        grid = {"lambda_R": lambdas, "lambda_S": lambdas, "tau_max": [2.0]}
-        table = pj.sweep(score, grid, shared=shared, batch=6)
-        best = table.best("psnr", mode="max")
-        paper = table["psnr"][np.argmin(abs(table["lambda_R"] - 1.2) + abs(table["lambda_S"] - 0.8))]
-        bounds = pj.sweep(
-            score,
-            {"lambda_R": [1.0], "lambda_S": [1.0], "tau_max": [1.0, 1.25, 1.5, 2.0, 3.0, 5.0]},
-            shared=shared,
-            batch=6,
-        )
-        freest = bounds.best("psnr", mode="max")
-        print(
-            f"| {name} | {paper:.2f} dB | {best['lambda_R']:.1f}, {best['lambda_S']:.1f} | {table['psnr'].max():.2f} dB"
-            f" | {freest['tau_max']:.2f} | {bounds['psnr'].max():.2f} dB |"
-        )
-        xs, ys, psnr = table.pivot("lambda_R", "lambda_S", "psnr")
-        image = axes.imshow(psnr, origin="lower", extent=(xs[0] - 0.1, xs[-1] + 0.1, ys[0] - 0.1, ys[-1] + 0.1))
-        axes.plot(1.2, 0.8, "x", color="red")
-        axes.plot(best["lambda_R"], best["lambda_S"], "o", mfc="none", mec="red")
-        axes.set(title=name, xlabel="lambda_R", ylabel="lambda_S")
-        figure.colorbar(image, ax=axes, label="PSNR [dB]")
-    figure.savefig(MEDIA / "ablation_lambdas.png", dpi=90)
-    print("\n![PSNR over both weights; cross: the paper's, circle: the best](media/ablation_lambdas.png)")
-
-
-PARTS = {"modes": ("The four modes", modes), "sweep": ("Weights and bounds", sweep)}
 
 if __name__ == "__main__":
-    run_parts("bench_ablation.py", "Ablation of the clamp", PARTS, __doc__)
+    main()
