@@ -167,6 +167,14 @@ def test_wrong_parameters_are_told(parameters):
         sweep_function(scored, parameters)
 
 
+def test_some_rows_are_a_table_too():
+    table = sweep(scored, {"a": [0.0, 1.0], "b": [1.0, -1.0]})
+    some = table.select(table["a"] == 1.0)
+    assert some.ok.tolist() == [True, False]
+    assert some["both"].tolist() == [[1.0, 1.0], [1.0, -1.0]]
+    assert some.errors == table.errors[2:]
+
+
 def test_no_good_row_and_unknown_columns_are_told():
     table = sweep(scored, {"a": [1.0], "b": [-1.0]})
     with pytest.raises(InputError, match="no good row"):

@@ -50,6 +50,13 @@ class Table:
             return np.asarray(self.parameters[name])
         raise InputError(f"table has no column {name!r}: it has {', '.join((*self.parameters, *self.results))}.")
 
+    def select(self, rows: Bool[np.ndarray, "n"]) -> Table:
+        """Only these rows."""
+        parameters, results = (
+            {name: column[rows] for name, column in columns.items()} for columns in (self.parameters, self.results)
+        )
+        return Table(parameters, results, self.ok[rows], tuple(e for e, kept in zip(self.errors, rows) if kept))
+
     def best(self, name: str, *, mode: Literal["min", "max"] = "min") -> dict[str, Any]:
         """Parameters of the row with the least (or the greatest) result.
 
