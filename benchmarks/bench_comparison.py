@@ -2,7 +2,8 @@
 
 Every method moves the bundled tabletop's cloud with known ids: E = 1e7 Pa and ν = 0.2 for all objects, the duck at
 (2, 0, 0) m/s, the mug at (1, -1, 0) m/s, the others at rest, the table fixed. `--only` names methods by a part of
-their name; with `--keep` a run goes on where an earlier one of the same settings stopped. `--write` replaces the table in the page and the pictures in docs/media.
+their name. With `--keep` a run goes on where an earlier one of the same settings stopped. `--write` replaces the table
+in the page and the pictures in docs/media.
 """
 
 import argparse

@@ -153,6 +153,7 @@ def test_period_of_a_single_spring():
     """Two masses on a spring: ω² = k / (reduced mass), so half a period turns the stretch round."""
     mass, stiffness = np.array([1.0, 3.0]), 50.0
     net = mass_spring.Network(*map(jnp.asarray, (mass, [[0, 1]], [1.0], [stiffness], [0.0])))
+    assert mass_spring.stable_step(net) == pytest.approx(1 / np.sqrt(2 * stiffness))  # of the lighter mass
     half = np.pi / np.sqrt(stiffness / (mass.prod() / mass.sum()))
     steps = 2000
     start = jnp.asarray([[0.0, 0, 0], [1.1, 0, 0]])
