@@ -21,8 +21,8 @@ TITLE, PICTURE = "Table", "comparison.jpg"
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--dx", type=float, default=0.02, help="of the grid [m]")
-    parser.add_argument("--frames", type=int, default=20)
+    parser.add_argument("--dx", type=float, default=0.025, help="of the grid [m]")
+    parser.add_argument("--frames", type=int, default=28)
     parser.add_argument("--fps", type=float, default=120.0, help="frames per second of the scene")
     parser.add_argument("--per-cell", type=int, default=2, help="Gaussians that become particles in a lattice cell")
     parser.add_argument("--only", nargs="*", default=[""], help="parts of methods' names")

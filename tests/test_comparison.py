@@ -57,10 +57,11 @@ def test_solid_is_carried_exactly_by_rigid_motion_and_follows_its_surface():
     solid, _ = ball(1.0, 0.2)
     shell = RNG.normal(size=(400, 3))
     shell /= np.linalg.norm(shell, axis=1, keepdims=True)
-    np.testing.assert_allclose(scores.carried(solid, shell, shell @ TURN.T + SHIFT), solid @ TURN.T + SHIFT, atol=1e-12)
+    moved = scores.carried(solid, shell, shell @ TURN.T + SHIFT, *scores.carriers(solid, shell))
+    np.testing.assert_allclose(moved, solid @ TURN.T + SHIFT, atol=1e-12)
     dented = shell * np.where(shell[:, :1] > 0.9, 0.8, 1.0)
     at = shell[np.argmax(shell[:, 0])][None]
-    moved = scores.carried(at, shell, dented)
+    moved = scores.carried(at, shell, dented, *scores.carriers(at, shell))
     np.testing.assert_allclose(moved, 0.8 * at, atol=0.03)
 
 

@@ -53,8 +53,8 @@ def ours(setting: Setting, ids: np.ndarray) -> Motion:
     return _by_particles(setting, np.where(buried, TABLE, ids), collider, mode="aligned")
 
 
-def as_physgaussian(setting: Setting, ids: np.ndarray) -> Motion:
-    inside = ids_in_boxes(np.asarray(setting.gaussians.means), ids, setting.moving)
+def as_physgaussian(setting: Setting, ids: np.ndarray, margin: float) -> Motion:
+    inside = ids_in_boxes(np.asarray(setting.gaussians.means), ids, setting.moving, margin)
     return _by_particles(setting, inside, setting.plane, mode="covariance")
 
 
@@ -141,7 +141,8 @@ def all_methods(setting: Setting) -> dict[str, Callable[[], Motion]]:
 
     return {
         "pigjax": lambda: ours(setting, ids),
-        "as PhysGaussian": lambda: as_physgaussian(setting, ids),
+        "as PhysGaussian, tight boxes": lambda: as_physgaussian(setting, ids, 0.0),
+        "as PhysGaussian, 1 cm wider": lambda: as_physgaussian(setting, ids, 0.01),
         "as PhysDreamer": lambda: as_physdreamer(setting, ids),
         "as Feature Splatting, unfilled": lambda: by_features(False),
         "as Feature Splatting, filled": lambda: by_features(True),

@@ -11,20 +11,24 @@ from scipy.spatial import cKDTree
 BOX = 4  # voxels' side in distances between the points that fill a solid
 
 
-def carried(solid: np.ndarray, rest: np.ndarray, moved: np.ndarray, neighbours: int = 8) -> np.ndarray:
+def carriers(solid: np.ndarray, rest: np.ndarray, neighbours: int = 8) -> tuple[np.ndarray, np.ndarray]:
+    """The Gaussians [p k] at rest [n 3] nearest to points [p 3] of a solid, and inverse square distances as weights."""
+    gap, near = cKDTree(rest).query(solid, k=np.arange(1, min(neighbours, len(rest)) + 1))
+    weights = 1 / np.maximum(gap, 1e-9) ** 2
+    return near, weights / weights.sum(1, keepdims=True)
+
+
+def carried(solid: np.ndarray, rest: np.ndarray, moved: np.ndarray, near: np.ndarray, weights: np.ndarray):
     """Points [p 3] of a solid after its Gaussians went from rest to moved [n 3].
 
-    The rigid motion that fits the Gaussians best (Kabsch 1976), and what their nearest ones do beyond it, by inverse
-    square distance: exact for rigid motion, and near the surface exact for any.
+    The rigid motion that fits the Gaussians best (Kabsch 1976), and what their `carriers` do beyond it: exact for rigid
+    motion, and near the surface exact for any.
     """
     middle, now = rest.mean(0), moved.mean(0)
     left, _, right = np.linalg.svd((moved - now).T @ (rest - middle))
     left[:, -1] *= np.sign(np.linalg.det(left @ right))
     rotation = left @ right
     beyond = moved - ((rest - middle) @ rotation.T + now)
-    gap, near = cKDTree(rest).query(solid, k=np.arange(1, min(neighbours, len(rest)) + 1))
-    weights = 1 / np.maximum(gap, 1e-9) ** 2
-    weights /= weights.sum(1, keepdims=True)
     return (solid - middle) @ rotation.T + now + np.einsum("pk,pkj->pj", weights, beyond[near])
 
 

@@ -72,4 +72,4 @@ def subset(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
 
 def camera(width: int = 240) -> Camera:
     """From above the near corner, with all objects in view."""
-    return look_at((0.45, -0.75, 0.95), (0.0, 0.0, 0.33), focal=1.15 * width, width=width, height=width * 3 // 4)
+    return look_at((0.42, -0.72, 0.9), (0.03, -0.05, 0.35), focal=1.5 * width, width=width, height=width * 3 // 4)

@@ -27,6 +27,7 @@ class Truth:
         self.rest = np.asarray(setting.gaussians.means, float)
         self.scales = np.exp(np.asarray(setting.gaussians.log_scales, float))
         self.rows = {number: np.flatnonzero(setting.scene.truth == number) for number in setting.moving}
+        self.carriers = {n: scores.carriers(self.solids[n][0], self.rest[rows]) for n, rows in self.rows.items()}
         self.links = {number: scores.link_length(self.rest[rows]) for number, rows in self.rows.items()}
         table = subset(setting.gaussians, np.flatnonzero(setting.scene.truth == TABLE))
         self.camera = camera()
@@ -35,7 +36,8 @@ class Truth:
     def penetration(self, means: np.ndarray) -> tuple[float, float]:
         """Volume [m³] that objects share with each other, and with the true table."""
         moved = [
-            scores.carried(self.solids[number][0], self.rest[rows], means[rows]) for number, rows in self.rows.items()
+            scores.carried(self.solids[number][0], self.rest[rows], means[rows], *self.carriers[number])
+            for number, rows in self.rows.items()
         ]
         moved = [np.where(np.isfinite(points), points, 1e3) for points in moved]
         inside = scores.volume_in_box(moved, self.volumes, *self.setting.table_box)
