@@ -7,11 +7,13 @@ in the page and the pictures in docs/media.
 """
 
 import argparse
+import functools
 from pathlib import Path
 
 import numpy as np
 from _timing import machine
 from bench_segmentation import MEDIA, replaced
+from comparison.kept import kept
 from comparison.methods import all_methods
 from comparison.setting import make_setting
 from comparison.study import HEADER, Truth, draw_rows, pictures, row
@@ -26,25 +28,18 @@ def main():
     parser.add_argument("--fps", type=float, default=120.0, help="frames per second of the scene")
     parser.add_argument("--per-cell", type=int, default=2, help="Gaussians that become particles in a lattice cell")
     parser.add_argument("--only", nargs="*", default=[""], help="parts of methods' names")
-    parser.add_argument("--keep", type=Path, help="folder in which finished methods are kept, and found by a later run")
+    parser.add_argument("--keep", type=Path, help="folder in which finished motions are kept, and found by a later run")
     parser.add_argument("--media", type=Path, default=MEDIA, help="folder of the picture")
     parser.add_argument("--write", type=Path, help="page whose table is replaced")
     options = parser.parse_args()
     setting = make_setting(options.dx, options.frames, options.fps, options.per_cell)
-    truth = Truth(setting)
+    truth = functools.cache(lambda: Truth(setting))
     lines, images = [HEADER], {}
     print(HEADER, flush=True)
-    for name, method in all_methods(setting).items():
+    for name, method in all_methods(setting, functools.partial(kept, options.keep)).items():
         if any(part in name for part in options.only):
-            kept = options.keep and options.keep / f"{name}.npz"
-            if kept and kept.exists():
-                saved = np.load(kept)
-                line, seen = str(saved["line"]), saved["images"]
-            else:
-                motion = method()
-                line, seen = row(name, motion, truth), pictures(motion)
-                if kept:
-                    np.savez(kept, line=line, images=seen)
+            motion = kept(options.keep, name, method)
+            line, seen = row(name, motion, truth()), pictures(motion)
             lines.append(line)
             images[name] = seen
             print(line, flush=True)

@@ -86,6 +86,7 @@ def as_physdreamer(setting: Setting, ids: np.ndarray) -> Motion:
 def as_spring_gaus(setting: Setting, ids: np.ndarray) -> Motion:
     filled, _ = _seeded(setting, ids, setting.plane)
     x, volume, number = _reduced(filled, ANCHORS)
+    volume = (np.bincount(number, volume) / np.bincount(number))[number]  # anchors weigh the same, as in the paper
     names = list(setting.materials)
     parts = [
         mass_spring.make_network(x[number == row], volume[number == row], young=YOUNG, density=DENSITY)
@@ -129,24 +130,23 @@ def feature_ids(setting: Setting, steps: int = TRAINING_STEPS) -> np.ndarray:
     return ids_by_members(members, np.asarray(similarities(features)))
 
 
-def all_methods(setting: Setting) -> dict[str, Callable[[], Motion]]:
-    """By name, each to be called when its turn comes."""
-    ids = lifted_ids(setting)
-    features: list[np.ndarray] = []  # trained once, for both rows that use them
+def all_methods(setting: Setting, kept: Callable[..., np.ndarray]) -> dict[str, Callable[[], Motion]]:
+    """By name, each to be called when its turn comes; `kept(name, make)` holds what several of them use."""
 
-    def by_features(fill: bool) -> Motion:
-        if not features:
-            features.append(feature_ids(setting))
-        return as_feature_splatting(setting, features[0], fill=fill)
+    def by_masks() -> np.ndarray:
+        return kept("ids of masks", lambda: lifted_ids(setting))
+
+    def by_features() -> np.ndarray:
+        return kept("ids of features", lambda: feature_ids(setting))
 
     return {
-        "pigjax": lambda: ours(setting, ids),
-        "as PhysGaussian, tight boxes": lambda: as_physgaussian(setting, ids, 0.0),
-        "as PhysGaussian, 1 cm wider": lambda: as_physgaussian(setting, ids, 0.01),
-        "as PhysDreamer": lambda: as_physdreamer(setting, ids),
-        "as Feature Splatting, unfilled": lambda: by_features(False),
-        "as Feature Splatting, filled": lambda: by_features(True),
-        "as Spring-Gaus": lambda: as_spring_gaus(setting, ids),
+        "pigjax": lambda: ours(setting, by_masks()),
+        "as PhysGaussian, tight boxes": lambda: as_physgaussian(setting, by_masks(), 0.0),
+        "as PhysGaussian, 1 cm wider": lambda: as_physgaussian(setting, by_masks(), 0.01),
+        "as PhysDreamer": lambda: as_physdreamer(setting, by_masks()),
+        "as Feature Splatting, unfilled": lambda: as_feature_splatting(setting, by_features(), fill=False),
+        "as Feature Splatting, filled": lambda: as_feature_splatting(setting, by_features(), fill=True),
+        "as Spring-Gaus": lambda: as_spring_gaus(setting, by_masks()),
     }
 
 
