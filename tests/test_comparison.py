@@ -13,6 +13,8 @@ from baselines.surface_only import ids_by_members
 from comparison import scores
 from scipy.spatial.transform import Rotation
 
+from pigjax.colliders import Plane
+
 RNG = np.random.default_rng(0)
 TURN, SHIFT = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix(), np.array([0.3, -0.2, 0.5])
 
@@ -162,6 +164,14 @@ def test_period_of_a_single_spring():
     assert float(x[1, 0] - x[0, 0]) == pytest.approx(0.9, abs=2e-4)
     # semi-implicit Euler is a quarter of dt out of phase: v = a · dt ω / 2 at the turning point
     np.testing.assert_allclose(v, 0, atol=2e-3)
+
+
+def test_network_slides_on_a_plane_by_coulombs_law():
+    net = mass_spring.Network(*map(jnp.asarray, ([1.0, 3.0], [[0, 1]], [1.0], [50.0], [0.0])))
+    plane = Plane(point=jnp.zeros(3), normal=jnp.asarray([0.0, 0, 1]), friction=jnp.asarray(0.3))
+    start, push = jnp.asarray([[0.0, 0, 0], [0, 1, 0]]), jnp.asarray([[2.0, 0, 0], [2, 0, 0]])
+    _, v = mass_spring.advance(net, start, push, 1e-3, 400, gravity=jnp.asarray([0, 0, -10.0]), collider=plane)
+    np.testing.assert_allclose(v, [[2 - 0.3 * 10 * 0.4, 0, 0]] * 2, atol=1e-3)
 
 
 def test_springs_hold_the_energy_of_the_cauchy_solid_they_stand_for():

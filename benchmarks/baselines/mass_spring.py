@@ -75,7 +75,7 @@ def advance(network: Network, x, v, dt, steps: int, *, gravity, collider=None):
         x, v = state
         v = v + dt * (spring_forces(network, x, v) / network.mass[:, None] + gravity)
         if collider is not None:
-            v = collider.apply(collider.contact(x), v)
+            v = collider.apply(collider.contact(x + dt * v), v)
         x = x + dt * v
         if collider is not None:
             x = _put_out(collider, x)
