@@ -39,6 +39,9 @@ MinSeen = Annotated[
     float | None, typer.Option(help="With --weighting alpha: least share of a Gaussian that views see.", min=0, max=1)
 ]
 Fill = Annotated[bool, typer.Option(help="Give unseen Gaussians the id of their neighbours; not with --min-seen.")]
+AccuracyOption = Annotated[
+    str | None, typer.Option("--accuracy", help="draft, standard or reference, instead of the scene file's.")
+]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")]
 
 
@@ -87,22 +90,26 @@ def example_folder() -> Path:
 
 
 @app.command()
-def demo(out: Out = Path("pigjax-demo")) -> None:
+def demo(out: Out = Path("pigjax-demo"), accuracy: AccuracyOption = None) -> None:
     """Simulate the bundled tabletop scene and leave a video."""
-    _run(example_folder() / "scene.toml", out)
+    _run(example_folder() / "scene.toml", out, accuracy)
 
 
 @app.command()
-def run(scene: Annotated[Path, typer.Argument(help="Scene file (.toml).")], out: Out = Path("out")) -> None:
+def run(
+    scene: Annotated[Path, typer.Argument(help="Scene file (.toml).")],
+    out: Out = Path("out"),
+    accuracy: AccuracyOption = None,
+) -> None:
     """Simulate a scene and draw its video; a killed run goes on from its last frame."""
-    _run(scene, out)
+    _run(scene, out, accuracy)
 
 
-def _run(path: Path, out: Path) -> None:
+def _run(path: Path, out: Path, accuracy: str | None) -> None:
     _one_device_per_core()
     from pigjax.scene import load_scene, run_scene
 
-    scene = load_scene(path)
+    scene = load_scene(path, accuracy=accuracy)
     with _progress() as bar:
         tasks: dict[str, TaskID] = {}
 

@@ -1,14 +1,25 @@
 """Every test runs with jaxtyping + beartype on the whole package, and with strict JAX modes."""
 
+import os
+
 from jaxtyping import install_import_hook
 
 hook = install_import_hook("pigjax", "beartype.beartype")
+os.environ.setdefault("PIGJAX_SHORT", "1")  # notebooks run in their short form
+flags = os.environ.get("XLA_FLAGS")
+# the workers share the cores already, so threads that compile beside each other only cost
+os.environ["XLA_FLAGS"] = f"{flags or ''} --xla_cpu_parallel_codegen_split_count=1"
 
 import jax  # noqa: E402  (the hook must be installed before pigjax is imported)
 import pytest  # noqa: E402
 
 jax.config.update("jax_numpy_rank_promotion", "allow")
 jax.config.update("jax_num_cpu_devices", 2)  # for what several devices share
+jax.devices()  # reads the flags, which commands that a test starts should not see
+if flags is None:
+    del os.environ["XLA_FLAGS"]
+else:
+    os.environ["XLA_FLAGS"] = flags
 
 
 @pytest.fixture

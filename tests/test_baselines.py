@@ -57,6 +57,7 @@ def encoding():
     return train_encoding(gaussians, views, NUM_IDS, steps=STEPS)
 
 
+@pytest.mark.slow
 def test_identity_encoding_recovers_the_ids():
     gaussians, views = two_balls()
     fitted = encoding()
@@ -75,6 +76,7 @@ def test_training_keeps_checkpoints_and_lowers_the_loss():
     assert fitted.mean_loss(STEPS, 4) == pytest.approx(np.mean(fitted.losses[-4:]))
 
 
+@pytest.mark.slow
 def test_feature_distillation_recovers_the_ids():
     gaussians, views = two_balls()
     features = train_features(gaussians, views, NUM_IDS, steps=STEPS).final

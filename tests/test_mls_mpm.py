@@ -350,7 +350,7 @@ DIFFERENTIATED = {
 }
 
 
-SLOW = ("fixed_corotated", "von_mises", "drucker_prager")  # to compile
+SLOW = ("fixed_corotated", "von_mises", "drucker_prager", "fluid")  # to compile
 
 
 @pytest.mark.parametrize("model", [pytest.param(m, marks=pytest.mark.slow) if m in SLOW else m for m in DIFFERENTIATED])

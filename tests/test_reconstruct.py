@@ -190,6 +190,7 @@ def test_masks_fit_one_object_and_leave_the_rest_out(views, tmp_path):
         reconstruct(masked, replace(config, object_id=9), points=points)
 
 
+@pytest.mark.slow
 def test_pose_refinement_takes_back_a_shifted_camera(views):
     loaded, points = views
     train = [k for k, split in enumerate(loaded.splits) if split == "train"]
@@ -243,7 +244,7 @@ def as_colmap(views, folder):
     (model / "points3D.txt").write_text("1 0 0 0 0 0 0 0\n")
 
 
-@pytest.mark.parametrize("write", [as_inria, as_colmap])
+@pytest.mark.parametrize("write", [pytest.param(as_inria, marks=pytest.mark.slow), as_colmap])
 def test_every_kind_of_capture_gives_the_same_reconstruction(tmp_path, write):
     """Real photos, their cameras said once as nerfstudio's and once as another format."""
     truth = io.load_views(TABLETOP, max_size=64, background=1.0)

@@ -379,7 +379,7 @@ def lists_of(gaussians, camera, config=DEFAULT):
     return projected, blending, boxes, projected.shapes[boxes.order]
 
 
-@pytest.mark.parametrize("slots", [12, 40, None])
+@pytest.mark.parametrize("slots", [12, pytest.param(40, marks=pytest.mark.slow), None])
 def test_pictures_and_gradients_do_not_depend_on_the_size_of_a_pass(slots):
     scene, camera = make_scene(count=150)
     gaussians = gaussians_of(scene)
@@ -472,7 +472,9 @@ def test_two_key_sort_makes_the_same_lists(monkeypatch):
     np.testing.assert_array_equal(two_keys.rank[:used], one_key.rank[:used])
 
 
-@pytest.mark.parametrize("together", [2, 5, 100])
+@pytest.mark.parametrize(
+    "together", [pytest.param(2, marks=pytest.mark.slow), 5, pytest.param(100, marks=pytest.mark.slow)]
+)
 def test_tiles_walked_together_draw_the_same(together):
     scene, camera = make_scene(count=100)
     gaussians = gaussians_of(scene)

@@ -19,6 +19,7 @@ from pigjax.matter import Grid, make_particles
 from pigjax.mls_mpm import SimConfig, step
 
 
+@pytest.mark.slow
 def test_fixed_free_bar_swings_with_its_period_to_first_order_of_its_wall(x64):
     """T = 4 L/c: 2.1 % at 10 cells and 1.0 % at 20, all of it the wall's: the free bar has a fourth of it."""
     coarse, fine = (period(cells, "fixed") - 1 for cells in (10, 20))
@@ -27,6 +28,7 @@ def test_fixed_free_bar_swings_with_its_period_to_first_order_of_its_wall(x64):
     assert math.log2(coarse / fine) > 0.9
 
 
+@pytest.mark.slow
 def test_manufactured_motion_of_a_free_bar_converges_with_second_order(x64):
     """7.1 % of the amplitude at 8 cells, 1.8 % at 16."""
     coarse, fine = free_error(8), free_error(16)
@@ -104,7 +106,9 @@ def test_dam_break_front_runs_as_in_the_experiment():
 
 
 @pytest.mark.parametrize(
-    ("aspect", "cells"), [(1.0, 16), pytest.param(3.0, 18, marks=pytest.mark.slow)], ids=["low", "high"]
+    ("aspect", "cells"),
+    [pytest.param(1.0, 16, marks=pytest.mark.slow), pytest.param(3.0, 18, marks=pytest.mark.slow)],
+    ids=["low", "high"],
 )
 def test_sand_column_runs_out_as_far_as_lubes(aspect, cells):
     """Within the 20 % that the experiments scatter; -11 % at a = 1 with 16 cells."""

@@ -28,7 +28,7 @@ from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec, suggest
 from pigjax.segmentation import Labels
 from pigjax.sleep import Sleep
 from pigjax.solids import collider_from_gaussians
-from pigjax.splat import Gaussians
+from pigjax.splat import Gaussians, RenderConfig
 
 
 @dataclass
@@ -240,10 +240,11 @@ def make_cameras(scene: Scene, inputs: Inputs, focus: Float[np.ndarray, "3"]) ->
         SceneError: `camera.view` is not the name of a photo.
     """
     spec, frames = scene.camera, scene.simulation.frames + 1
+    width, height = (max(round(side * scene.drawing.scale), 1) for side in (spec.width, spec.height))
     if spec.view is not None:
-        return stack_cameras([_camera_of_view(spec, inputs)] * frames)
+        return stack_cameras([_camera_of_view(spec, inputs).resized(width, height)] * frames)
     target = np.array(spec.target) if spec.target is not None else focus
-    focal = spec.width / (2 * np.tan(np.radians(spec.field_of_view) / 2))
+    focal = width / (2 * np.tan(np.radians(spec.field_of_view) / 2))
     means = np.asarray(inputs.gaussians.means)
     radius = spec.radius if spec.radius is not None else 2.0 * float(np.median(np.linalg.norm(means - target, axis=1)))
     return orbit(
@@ -252,11 +253,22 @@ def make_cameras(scene: Scene, inputs: Inputs, focus: Float[np.ndarray, "3"]) ->
         elevation=np.radians(spec.elevation),
         frames=frames,
         focal=focal,
-        width=spec.width,
-        height=spec.height,
+        width=width,
+        height=height,
         start=np.radians(spec.start),
         sweep=np.radians(spec.sweep),
         up=axis_of(scene.input.up),
+    )
+
+
+def render_config(scene: Scene) -> RenderConfig:
+    """Settings of the scene's video, drawn by all local devices."""
+    spec = scene.drawing
+    return RenderConfig(
+        bands=jax.local_device_count(),
+        sh_degree=spec.sh_degree,
+        alpha_min=spec.alpha_min,
+        transmittance_min=spec.transmittance_min,
     )
 
 
@@ -264,13 +276,16 @@ def _camera_of_view(spec: CameraSpec, inputs: Inputs) -> Camera:
     if inputs.views is None or spec.view not in inputs.views.names:
         names = () if inputs.views is None else inputs.views.names
         raise SceneError(f"camera.view = {spec.view!r}: {suggest(str(spec.view), names)}.")
-    return inputs.views.cameras[inputs.views.names.index(spec.view)].resized(spec.width, spec.height)
+    return inputs.views.cameras[inputs.views.names.index(spec.view)]
 
 
 def signature(scene: Scene) -> str:
-    """Hash of all that the simulated states depend on; the camera, the clamp and the video do not count."""
+    """Hash of all that the simulated states depend on; the camera, the clamp and the video do not count.
+
+    Nor does the name of the accuracy, but what it set.
+    """
     settings: dict[str, Any] = msgspec.to_builtins(scene)
-    for name in ("camera", "clamp", "folder"):
+    for name in ("accuracy", "camera", "clamp", "drawing", "folder"):
         settings.pop(name)
     digest = hashlib.sha256(msgspec.json.encode(settings))
     digest.update(scene.path(scene.input.gaussians).read_bytes())

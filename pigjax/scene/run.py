@@ -21,12 +21,12 @@ from pigjax.matter import Health, Particles, fit_grid, vast_grid
 from pigjax.mls_mpm import choose_integrator, choose_substeps
 from pigjax.overlay import id_image, legend_sheet, overlay
 from pigjax.particles import deform
-from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, segment, signature
+from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, render_config, segment, signature
 from pigjax.scene.report import RunReport
 from pigjax.scene.schema import Scene
 from pigjax.segmentation import Labels
 from pigjax.sleep import Sleeper
-from pigjax.splat import Gaussians, RenderConfig, render
+from pigjax.splat import Gaussians, render
 
 _SHEET_FRAMES = 12
 Progress = Callable[[str, int, int], None]  # stage, done, of
@@ -86,6 +86,7 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
     names = {number: name for name, number in inputs.ids.items()}
     object_id, counts = np.asarray(labels.object_id), dict(zip(plan.table.laws, plan.particles.counts))
     report.modelled |= {
+        "accuracy": scene.accuracy,
         "laws": sorted(set(plan.table.laws)),
         "colliders": [type(c).__name__ for c in plan.colliders],
         "kernel": plan.config.kernel,
@@ -182,7 +183,7 @@ def _draw(
     focus = np.asarray(plan.particles.x).mean(0)
     cameras = make_cameras(scene, inputs, focus)
     background = jnp.asarray(scene.camera.background)
-    config = RenderConfig(bands=jax.local_device_count())
+    config = render_config(scene)
 
     # everything large comes in as an argument: XLA would fold constants for minutes
     @jax.jit

@@ -17,6 +17,7 @@ from msgspec.structs import asdict
 from pigjax.colliders import Box, Capsule, Collider, Cylinder, Plane, Sphere
 from pigjax.errors import InputError, MissingFileError, SceneError
 from pigjax.materials import PRESETS, Material, Parameters
+from pigjax.scene.accuracy import LEVELS, Accuracy, with_level
 
 Triple = tuple[float, float, float]
 _NUMBERS = tuple(field.name for field in fields(Parameters))
@@ -84,6 +85,15 @@ class CameraSpec(Struct, forbid_unknown_fields=True, frozen=True):
     width: int = 512  # [px]
     height: int = 512
     background: float | Triple = 0.0
+
+
+class DrawingSpec(Struct, forbid_unknown_fields=True, frozen=True):
+    """How exactly the video is drawn; see `RenderConfig`."""
+
+    scale: float = 1.0  # of the video's width and height: 0.5 draws a quarter of the pixels
+    sh_degree: int | None = None  # bands of view-dependent colour; None: all
+    alpha_min: float = 1 / 255  # fainter contributions are skipped
+    transmittance_min: float = 1e-4  # a pixel is closed before it falls below
 
 
 class ObjectSpec(Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
@@ -207,6 +217,8 @@ class Scene(Struct, forbid_unknown_fields=True, frozen=True):
     segmentation: SegmentationSpec = SegmentationSpec()
     clamp: ClampSpec = ClampSpec()
     camera: CameraSpec = CameraSpec()
+    drawing: DrawingSpec = DrawingSpec()
+    accuracy: Accuracy = "standard"  # sets at once what the file leaves open, and scales its dx; see `accuracy`
     planes: dict[str, PlaneSpec] = {}
     boxes: dict[str, BoxSpec] = {}
     spheres: dict[str, SphereSpec] = {}
@@ -239,8 +251,12 @@ _COLLIDERS = {
 }
 
 
-def load_scene(path: str | Path) -> Scene:
+def load_scene(path: str | Path, *, accuracy: str | None = None) -> Scene:
     """Read and check a scene file. Host.
+
+    Args:
+        path: the file (.toml).
+        accuracy: "draft", "standard" or "reference", instead of the file's.
 
     Raises:
         MissingFileError: there is no such file.
@@ -254,15 +270,23 @@ def load_scene(path: str | Path) -> Scene:
         values = tomllib.loads(path.read_text())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise SceneError(f"{path}: not valid TOML: {error}.") from None
-    return scene_from(values, folder=path.parent, where=str(path))
+    return scene_from(values, folder=path.parent, where=str(path), accuracy=accuracy)
 
 
-def scene_from(values: dict[str, Any], *, folder: str | Path = ".", where: str = "scene") -> Scene:
+def scene_from(
+    values: dict[str, Any], *, folder: str | Path = ".", where: str = "scene", accuracy: str | None = None
+) -> Scene:
     """A scene from plain values, as TOML gives them, checked.
+
+    The scene holds what `accuracy` (or the values' own) makes of them: its `simulation.dx` is the one of that level.
 
     Raises:
         SceneError: as `load_scene`.
     """
+    level = values.get("accuracy", "standard") if accuracy is None else accuracy
+    if not isinstance(level, str) or level not in LEVELS:
+        raise SceneError(f"{where}: accuracy = {level!r}: {suggest(str(level), LEVELS)}.")
+    values = with_level(values, level)
     try:
         scene = msgspec.convert({**values, "folder": str(folder)}, Scene)
     except msgspec.ValidationError as error:
@@ -282,12 +306,19 @@ def _check(scene: Scene, where: str) -> None:
         "camera.width": scene.camera.width,
         "camera.height": scene.camera.height,
         "camera.field_of_view": scene.camera.field_of_view,
+        "drawing.scale": scene.drawing.scale,
     }
     if scene.simulation.sleep is not None:
         positive["simulation.sleep"] = scene.simulation.sleep
     for name, value in positive.items():
         if not 0 < value < float("inf"):
             raise SceneError(f"{where}: {name} = {value}: it must be > 0.")
+    for name in ("alpha_min", "transmittance_min"):
+        low = getattr(scene.drawing, name)
+        if not 0 <= low < 1:
+            raise SceneError(f"{where}: drawing.{name} = {low}: it must lie in [0, 1).")
+    if scene.drawing.sh_degree not in (None, 0, 1, 2, 3):
+        raise SceneError(f"{where}: drawing.sh_degree = {scene.drawing.sh_degree}: choose 0, 1, 2 or 3.")
     moving = [name for name, spec in scene.objects.items() if not spec.fixed]
     if not moving:
         raise SceneError(f"{where}: objects: none moves; give at least one a material.")
@@ -324,7 +355,7 @@ def explain(message: str, values: dict[str, Any], fields_at: Callable[[str], Seq
 def _fields_at(place: str) -> tuple[str, ...]:
     structs = {"": Scene, "objects": ObjectSpec, **_COLLIDERS}
     structs |= {"input": InputSpec, "segmentation": SegmentationSpec, "simulation": SimulationSpec}
-    structs |= {"clamp": ClampSpec, "camera": CameraSpec}
+    structs |= {"clamp": ClampSpec, "camera": CameraSpec, "drawing": DrawingSpec}
     fields = structs.get(place.split(".")[0], Scene).__struct_fields__
     return tuple(name for name in fields if name != "folder")
 

@@ -1,0 +1,59 @@
+"""How wrong an answer is, against a reference."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Displacement(NamedTuple):
+    """Errors of tracer points, as shares of the distance that they travelled (root mean squares)."""
+
+    total: float
+    centre: float  # of the centre of mass of each body
+    shape: float  # what is left without the centres
+
+
+def displacement_error(x, reference, rest, body) -> Displacement:
+    """Positions after the same time [p 3], those of the reference, at rest, and the body of each point [p].
+
+    Points count alike; total² = centre² + shape².
+    """
+    x, reference, rest = (np.asarray(a, np.float64) for a in (x, reference, rest))
+    body = np.asarray(body)
+    travelled = np.sqrt(np.mean(np.sum((reference - rest) ** 2, 1)))
+    difference, centre = x - reference, np.empty_like(x)
+    for number in np.unique(body):
+        centre[body == number] = difference[body == number].mean(0)
+    sizes = [np.sqrt(np.mean(np.sum(d**2, 1))) / travelled for d in (difference, centre, difference - centre)]
+    return Displacement(*(float(size) for size in sizes))
+
+
+def video_psnr(frames, reference) -> float:
+    """PSNR [dB] over all pixels of all frames [t h w 3] in [0, 1]; smaller frames are first enlarged, bilinearly."""
+    reference = np.asarray(reference, np.float64)
+    frames = enlarged(np.asarray(frames, np.float64), reference.shape[1:3])
+    return float(-10 * np.log10(np.mean((frames - reference) ** 2)))
+
+
+def root_mean_square(frames, reference) -> float:
+    """Of the difference of colours in [0, 1]: 10^(-PSNR/20)."""
+    return 10 ** (-video_psnr(frames, reference) / 20)
+
+
+def enlarged(frames, size) -> np.ndarray:
+    """Frames [t h w 3] at another size (h, w), linear between pixel centres, edges repeated."""
+    for axis, count in zip((1, 2), size):
+        old = frames.shape[axis]
+        if old == count:
+            continue
+        place = np.clip((np.arange(count) + 0.5) * old / count - 0.5, 0, old - 1)
+        low = np.minimum(place.astype(int), max(old - 2, 0))
+        high = np.minimum(low + 1, old - 1)
+        share = (place - low).reshape([-1 if a == axis else 1 for a in range(4)])
+        frames = (1 - share) * np.take(frames, low, axis) + share * np.take(frames, high, axis)
+    return frames
+
+
+def share_right(found, truth) -> float:
+    """Share of Gaussians with their true id."""
+    return float(np.mean(np.asarray(found) == np.asarray(truth)))

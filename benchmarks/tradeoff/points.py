@@ -1,0 +1,97 @@
+"""Settings measured beside each other: warm medians in turn, the Pareto set, a table and a plot."""
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+
+class Point(NamedTuple):
+    """One setting: what it takes and how wrong it is."""
+
+    name: str
+    knob: str  # that differs from the standard
+    seconds: float  # median of warm runs
+    error: float  # smaller is better
+    compile_seconds: float = float("nan")  # first run, less a warm one
+    note: str = ""
+
+
+class Timed(NamedTuple):
+    seconds: float
+    compile_seconds: float
+    result: Any
+
+
+def in_turn(runs: dict[str, Callable[[], Any]], windows: int = 3) -> dict[str, Timed]:
+    """Each run once to compile, then all of them in turn `windows` times, so that all meet the same machine."""
+    first, results, times = {}, {}, {name: [] for name in runs}
+    for name, run in runs.items():
+        first[name], results[name] = _clock(run)
+    for _ in range(windows):
+        for name, run in runs.items():
+            times[name].append(_clock(run)[0])
+    medians = {name: statistics.median(values) for name, values in times.items()}
+    return {name: Timed(medians[name], max(first[name] - medians[name], 0.0), results[name]) for name in runs}
+
+
+def _clock(run):
+    begun = time.perf_counter()
+    result = jax.block_until_ready(run())
+    return time.perf_counter() - begun, result
+
+
+def pareto(points: Sequence[Point]) -> set[str]:
+    """Names of the points that no other beats: none is at least as fast and as right, and better in one of the two."""
+    best, least = set(), float("inf")
+    for point in sorted(points, key=lambda p: (p.seconds, p.error)):
+        ties = [p for p in points if (p.seconds, p.error) == (point.seconds, point.error)]
+        if point.error < least:
+            best |= {p.name for p in ties}
+            least = point.error
+    return best
+
+
+def table(points: Sequence[Point], *, error: str, show: Callable[[float], str] = "{:.2e}".format) -> str:
+    """Markdown, fastest first, members of the Pareto set in bold."""
+    best = pareto(points)
+    rows = [f"| setting | knob | time [s] | {error} | compile [s] | |", "|---|---|---|---|---|---|"]
+    for point in sorted(points, key=lambda p: p.seconds):
+        name = f"**{point.name}**" if point.name in best else point.name
+        compiled = "" if point.compile_seconds != point.compile_seconds else f"{point.compile_seconds:.1f}"
+        rows.append(
+            f"| {name} | {point.knob} | {point.seconds:.3g} | {show(point.error)} | {compiled} | {point.note} |"
+        )
+    return "\n".join(rows)
+
+
+def plot(panels: dict[str, Sequence[Point]], path: Path, *, error: str, floors: dict[str, float] | None = None) -> None:
+    """One panel per scene: settings coloured by knob, the Pareto set joined, floors of the error dashed."""
+    figure, axes = plt.subplots(
+        1, len(panels), figsize=(4.6 * len(panels), 4), layout="constrained", dpi=90, squeeze=False
+    )
+    knobs = list(dict.fromkeys(point.knob for points in panels.values() for point in points))
+    for axis, (title, points) in zip(axes[0], panels.items()):
+        best = sorted((p for p in points if p.name in pareto(points)), key=lambda p: p.seconds)
+        axis.plot([p.seconds for p in best], [p.error for p in best], color="0.7", zorder=0)
+        for number, knob in enumerate(knobs):
+            mine = [p for p in points if p.knob == knob]
+            axis.scatter([p.seconds for p in mine], [p.error for p in mine], color=f"C{number}", label=knob, s=28)
+        for point in points:
+            axis.annotate(point.name, (point.seconds, point.error), xytext=(4, 3), textcoords="offset points",
+                          fontsize=6.5, color="black" if point in best else "0.45")  # fmt: skip
+        if floors and title in floors:
+            axis.axhline(floors[title], ls="--", color="0.4", lw=0.8, label="floor")
+        axis.set(title=title, xlabel="time [s]", xscale="log", yscale="log")
+        axis.margins(x=0.2)
+    axes[0, 0].set_ylabel(error)
+    axes[0, -1].legend(fontsize=7)
+    figure.savefig(path)
+    plt.close(figure)

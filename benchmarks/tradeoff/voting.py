@@ -1,0 +1,71 @@
+"""Voting: share of Gaussians with their true id, over views, resolution of depth and the way of counting."""
+
+import statistics
+from pathlib import Path
+
+import jax
+import numpy as np
+from segmentation.tabletop import load_tabletop
+
+from pigjax.segmentation import enough_capacity, lift_masks
+from pigjax.splat import RenderConfig
+from tradeoff.errors import share_right
+from tradeoff.points import Point, in_turn, plot, table
+
+PLOT = "tradeoff_voting.png"
+STANDARD = {"every": 1, "size": 256}
+SETTINGS = {
+    "standard": ("standard", {}),
+    "20 views": ("views", {"every": 2}),
+    "10 views": ("views", {"every": 4}),
+    "5 views": ("views", {"every": 8}),
+    "128²": ("resolution", {"size": 128}),
+    "64²": ("resolution", {"size": 64}),
+    "lowest id of ties": ("ties", {"ties": "lowest"}),
+    "alpha·T": ("weighting", {"weighting": "alpha"}),
+    "10 views, 128²": ("views", {"every": 4, "size": 128}),
+}
+
+
+def study(folder: Path, scenes) -> str:
+    """Table and a plot in `folder`; only the tabletop has more than one object."""
+    if "tabletop" not in scenes:
+        return "Only the tabletop has several objects to tell apart."
+    scene = load_tabletop()
+    runs = {name: _vote(scene, **STANDARD | fields) for name, (_, fields) in SETTINGS.items()}
+    points = []
+    for name, timed in in_turn(runs).items():
+        found = np.asarray(timed.result)
+        right = share_right(found, scene.truth)
+        note = f"{100 * right:.2f} % right, {100 * np.mean(found < 0):.2f} % never seen"
+        points.append(Point(name, SETTINGS[name][0], timed.seconds, 1 - right, timed.compile_seconds, note))
+    spread = _spread(scene)
+    plot({"tabletop": points}, folder / PLOT, error="share of wrong ids")
+    head = (
+        f"{len(scene.truth)} Gaussians with known ids, {len(scene.train)} views. Reference: the truth. Which views"
+        f" they are moves the share of 10 views by {spread:.1e} (standard deviation over four disjoint sets). The small"
+        " scenes have one object each, so nothing to vote on."
+    )
+    return "\n\n".join(
+        [head, table(points, error="share wrong", show="{:.4f}".format), f"![error against time](media/{PLOT})"]
+    )
+
+
+def _vote(scene, every, size, start=0, **options):
+    train = scene.train[start::every]
+    pixel = (np.arange(size) * 2 + 1) * scene.train.masks.shape[1] // (2 * size)
+    cameras, masks = train.cameras.resized(size, size), train.masks[:, pixel[:, None], pixel]
+    gaussians = scene.gaussians
+    config = enough_capacity(gaussians, cameras, RenderConfig())
+    vote = jax.jit(
+        lambda gaussians, cameras: (
+            lift_masks(gaussians, cameras, masks, num_ids=scene.num_ids, config=config, **options).object_id
+        )
+    )
+    return lambda: vote(gaussians, cameras)
+
+
+def _spread(scene) -> float:
+    """Standard deviation of the share right over disjoint fourths of the views."""
+    rights = [share_right(_vote(scene, every=4, size=256, start=k)(), scene.truth) for k in range(4)]
+    return statistics.stdev(rights)

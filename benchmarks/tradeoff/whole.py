@@ -1,0 +1,61 @@
+"""The whole pipeline: the video's error against the reference's, for the levels of `accuracy` and for single knobs."""
+
+from pathlib import Path
+
+import numpy as np
+
+from tradeoff.errors import root_mean_square, video_psnr
+from tradeoff.points import Point, in_turn, plot, table
+from tradeoff.scenes import draw, simulate, source
+
+PLOT = "tradeoff_whole.png"
+LEVELS = ("draft", "standard", "reference")
+KNOBS = {
+    "half size": ("drawing", {"drawing": {"scale": 0.5}}),
+    "SH 0": ("drawing", {"drawing": {"sh_degree": 0}}),
+    "4 a cell": ("matter", {"simulation": {"particles_per_cell": 4}}),
+}
+SEED = {"simulation": {"seed": 1}}
+
+
+def study(folder: Path, scenes) -> str:
+    """Tables of all scenes, and one plot in `folder`."""
+    panels, floors, text = {}, {}, []
+    for name in scenes:
+        panels[name], floors[name], said = _study(name)
+        text += [f"**{name}**", said, table(panels[name], error="RMS error of colour")]
+    plot(panels, folder / PLOT, error="RMS error of colour in the video", floors=floors)
+    head = (
+        "Seeding, simulating and drawing; reading and voting are the same for all. Error: all frames against those of"
+        ' accuracy = "reference", smaller ones enlarged.'
+    )
+    return "\n\n".join([head, *text, f"![error against time of the whole pipeline](media/{PLOT})"])
+
+
+def _study(name):
+    of = source(name)
+    dx = of.values["simulation"]["dx"]
+    scenes = {level: of.scene(level) for level in LEVELS}
+    scenes |= {key: of.scene(**fields) for key, (_, fields) in KNOBS.items()}
+    scenes["dx × 1.5"] = of.scene(simulation={"dx": 1.5 * dx})
+    runs = {key: (lambda scene=scene: _video(of, scene)) for key, scene in scenes.items()}
+    timed = in_turn(runs, windows=1 if name == "tabletop" else 3)
+    reference, standard = (np.asarray(timed[level].result) for level in ("reference", "standard"))
+    points = []
+    for key, run in timed.items():
+        if key != "reference":
+            knob = "accuracy" if key in LEVELS else KNOBS.get(key, ("matter",))[0]
+            psnr = video_psnr(run.result, reference)
+            error = root_mean_square(run.result, reference)
+            points.append(Point(key, knob, run.seconds, error, run.compile_seconds, f"PSNR {psnr:.1f} dB"))
+    reseeded = video_psnr(_video(of, of.scene(**SEED)), standard)
+    said = (
+        f"Reference: {timed['reference'].seconds:.3g} s. Floor: another seed of the filling changes the standard's video"
+        f" to {reseeded:.1f} dB of itself; errors near it are noise."
+    )
+    return points, 10 ** (-reseeded / 20), said
+
+
+def _video(of, scene):
+    plan = of.plan(scene)
+    return draw(of, scene, plan, simulate(scene, plan)[1])

@@ -1,0 +1,34 @@
+"""Speed against accuracy in one word: `draft`, `standard` or `reference`, chosen by benchmarks/bench_tradeoff.py."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple
+
+Accuracy = Literal["draft", "standard", "reference"]
+
+
+class Level(NamedTuple):
+    """What a level sets where the scene file says nothing, and how it scales the file's grid spacing."""
+
+    coarsening: float  # dx is this times the file's
+    defaults: dict[str, dict[str, Any]]  # by section and field
+
+
+LEVELS: dict[str, Level] = {
+    "draft": Level(1.5, {"drawing": {"scale": 0.5, "sh_degree": 0, "transmittance_min": 1e-2}}),
+    "standard": Level(1.0, {}),
+    "reference": Level(0.75, {"drawing": {"transmittance_min": 1e-6, "alpha_min": 1e-4}}),
+}
+
+
+def with_level(values: dict[str, Any], level: str) -> dict[str, Any]:
+    """Values of a scene file with what the level sets; fields that the file gives stay, but for the scaled dx."""
+    coarsening, defaults = LEVELS[level]
+    filled = {**values, "accuracy": level}
+    for section, fields in defaults.items():
+        given = values.get(section, {})
+        filled[section] = {**fields, **given} if isinstance(given, dict) else given
+    simulation = filled.get("simulation")
+    if coarsening != 1 and isinstance(simulation, dict) and type(simulation.get("dx")) in (int, float):
+        filled["simulation"] = {**simulation, "dx": simulation["dx"] * coarsening}
+    return filled
