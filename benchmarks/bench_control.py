@@ -45,15 +45,14 @@ def prepared():
     return made, {THROW: Bounds(throw.low, throw.high)}
 
 
-@cache
-def objective():
-    return objective_of("knock_off.py:objective", {}, STUDIES)
+def scores_of(outcome, approach=0.3):
+    """`approach` is the weight of the nearest pass."""
+    return objective_of("knock_off.py:objective", {"approach": approach}, STUDIES)(outcome)
 
 
 def loss(values, shared):
-    """Of a throw; `approach` is the weight of the nearest pass."""
     made, approach = shared
-    scores = objective()(made.with_parameters(values).simulate(), approach=approach)
+    scores = scores_of(made.with_parameters(values).simulate(), approach)
     return scores["loss"], scores
 
 
@@ -64,7 +63,7 @@ def start_of(velocity):
 @jax.jit
 def ending(values, made):
     outcome = made.with_parameters(values).simulate()
-    return objective()(outcome), outcome.experiment.video(outcome.trajectory)
+    return scores_of(outcome), outcome.experiment.video(outcome.trajectory)
 
 
 def row(name, values):
