@@ -50,8 +50,8 @@ def _study(name):
             points.append(Point(key, knob, run.seconds, error, run.compile_seconds, f"PSNR {psnr:.1f} dB"))
     reseeded = video_psnr(_video(of, of.scene(**SEED)), standard)
     said = (
-        f"Reference: {timed['reference'].seconds:.3g} s. Floor: another seed of the filling changes the standard's video"
-        f" to {reseeded:.1f} dB of itself; errors near it are noise."
+        f"Reference: {timed['reference'].seconds:.3g} s. Floor: another seed of the filling changes the standard's"
+        f" video to {reseeded:.1f} dB of itself; errors near it are noise."
     )
     return points, 10 ** (-reseeded / 20), said
 
