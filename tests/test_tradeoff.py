@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tradeoff.errors import displacement_error, enlarged, share_right, video_psnr
+from tradeoff.errors import displacement_error, distance_travelled, enlarged, share_right, video_psnr
 from tradeoff.points import Point, in_turn, pareto, table
 from typer.testing import CliRunner
 
@@ -143,15 +143,20 @@ def test_table_marks_the_pareto_set_fastest_first():
 def test_displacement_error_splits_into_centres_and_shape():
     rng = np.random.default_rng(0)
     rest, body = rng.normal(size=(40, 3)), np.repeat([1, 2], [10, 30])
-    reference = rest + np.array([3.0, 0.0, 4.0])  # travelled 5
+    reference = rest + np.array([3.0, 0.0, 4.0])
     moved = reference + np.where(body == 1, 0.2, -0.1)[:, None] * [1, 0, 0]
-    error = displacement_error(moved, reference, rest, body)
+    error = displacement_error(moved, reference, 5.0, body)
     assert error.centre == pytest.approx(math.sqrt((10 * 0.2**2 + 30 * 0.1**2) / 40) / 5)
     assert error.shape == pytest.approx(0, abs=1e-12)
     wobble = np.tile([[0.3, 0, 0], [-0.3, 0, 0]], (20, 1))
-    error = displacement_error(moved + wobble, reference, rest, body)
+    error = displacement_error(moved + wobble, reference, 5.0, body)
     assert error.shape == pytest.approx(0.3 / 5)
     assert error.total == pytest.approx(math.hypot(error.centre, error.shape))
+
+
+def test_distance_counts_the_way_there_and_back():
+    path = np.array([[[0, 0, 0], [0, 0, 0]], [[3, 0, 4], [0, 1, 0]], [[0, 0, 0], [0, 0, 0]]])
+    assert distance_travelled(path) == pytest.approx(math.sqrt((10**2 + 2**2) / 2))
 
 
 def test_psnr_of_a_video_and_of_a_smaller_one():

@@ -13,14 +13,22 @@ class Displacement(NamedTuple):
     shape: float  # what is left without the centres
 
 
-def displacement_error(x, reference, rest, body) -> Displacement:
-    """Positions after the same time [p 3], those of the reference, at rest, and the body of each point [p].
+def distance_travelled(path) -> float:
+    """Root mean square over points of the length of their path [t p 3], the start included.
+
+    What bounces ends near its start, so the distance between the two would measure nothing.
+    """
+    steps = np.linalg.norm(np.diff(np.asarray(path, np.float64), axis=0), axis=2)
+    return float(np.sqrt(np.mean(steps.sum(0) ** 2)))
+
+
+def displacement_error(x, reference, travelled, body) -> Displacement:
+    """Positions after the same time [p 3], those of the reference, its distance, and the body of each point [p].
 
     Points count alike; total² = centre² + shape².
     """
-    x, reference, rest = (np.asarray(a, np.float64) for a in (x, reference, rest))
+    x, reference = (np.asarray(a, np.float64) for a in (x, reference))
     body = np.asarray(body)
-    travelled = np.sqrt(np.mean(np.sum((reference - rest) ** 2, 1)))
     difference, centre = x - reference, np.empty_like(x)
     for number in np.unique(body):
         centre[body == number] = difference[body == number].mean(0)

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from tradeoff.errors import displacement_error
+from tradeoff.errors import displacement_error, distance_travelled
 from tradeoff.points import Point, in_turn, plot, table
 from tradeoff.scenes import as_float64, simulate, source, tracers
 
@@ -52,19 +52,21 @@ def _study(name):
     settings = {"standard": ("standard", {}), **KNOBS[name]}
     plans = {key: of.plan(of.scene(simulation=fields)) for key, (_, fields) in settings.items()}
     scenes = {key: of.scene(simulation=fields) for key, (_, fields) in settings.items()}
-    runs = {key: (lambda key=key: simulate(scenes[key], plans[key])[0].x) for key in settings}
+    runs = {key: (lambda key=key: simulate(scenes[key], plans[key])[1].x) for key in settings}
     if name != "tabletop":
         settings["float64"] = ("precision", {})
         runs["float64"] = lambda: _in_float64(scenes["standard"], plans["standard"])
     timed = in_turn(runs, windows=3 if name != "tabletop" else 1)
     count = len(of.inputs.gaussians)
-    ends = {key: _of_gaussians(plans.get(key, plans["standard"]), timed[key].result, count) for key in settings}
-    rest = _of_gaussians(plans["standard"], plans["standard"].particles.x, count)
+    ends = {key: _of_gaussians(plans.get(key, plans["standard"]), timed[key].result[-1], count) for key in settings}
+    finest, way = plans["reference"], np.asarray(timed["reference"].result)
+    rows, _ = tracers(finest, count)
+    travelled = distance_travelled(np.concatenate([np.asarray(finest.particles.x)[None, rows], way[:, rows]]))
     body = np.asarray(of.labels.object_id)
 
     def error(x, reference):
-        both = np.isfinite(x[:, 0]) & np.isfinite(reference[:, 0]) & np.isfinite(rest[:, 0])
-        return displacement_error(x[both], reference[both], rest[both], body[both])
+        both = np.isfinite(x[:, 0]) & np.isfinite(reference[:, 0])
+        return displacement_error(x[both], reference[both], travelled, body[both])
 
     points = []
     for key, (knob, _) in settings.items():
@@ -95,7 +97,7 @@ def _of_gaussians(plan, x, count):
 def _in_float64(scene, plan):
     with jax.enable_x64(True):
         parts = {name: as_float64(getattr(plan, name)) for name in ("particles", "table", "colliders")}
-        return simulate(scene, replace(plan, **parts))[0].x
+        return simulate(scene, replace(plan, **parts))[1].x
 
 
 def _floors(of, scene, plan, count):
