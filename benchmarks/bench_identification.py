@@ -30,7 +30,7 @@ STUDIES = Path(__file__).parents[1] / "examples" / "studies"
 MEDIA = Path(__file__).parents[1] / "docs" / "media"
 STIFF = Bounds(1e3, 4e4, "log")
 SPEED = Bounds(-4.0, 4.0)
-STEPS = 80
+STEPS = 60
 DUCK = {"objects.duck.young": 8e3, "objects.duck.velocity": [0.4, -0.3, -1.5]}
 DUCK_START = {"objects.duck.young": 3.2e4, "objects.duck.velocity": [0.38, -0.11, -1.05]}
 
@@ -135,7 +135,7 @@ def field() -> None:
     made = made.with_parameters(thrown)
     target = film(arrays(truth), made)
     bounds = {"objects.duck.young": STIFF, "objects.duck.density": Bounds(300.0, 3000.0, "log")}
-    best, history, seconds = descend(made, target, start, bounds=bounds, steps=120)
+    best, history, seconds = descend(made, target, start, bounds=bounds, steps=70)
     report(truth, start, best, history, seconds)
     # what the video says of each combination: J'J of the frames by the logarithms of the parameters
     names = list(truth)
@@ -202,7 +202,7 @@ def cost() -> None:
     print("| way | losses | gradients | s | E | v0 |\n|---|---|---|---|---|---|")
     best, history, seconds = descend(made, target, DUCK_START)
     print(f"| Adam | 0 | {len(history)} | {seconds:.0f} | " + errors_of(best))
-    for evaluations in (160, 480):
+    for evaluations in (240,):
         begun = time.perf_counter()
         best, history = search(loss, start, evaluations=evaluations, bounds=limits, shared=shared)
         print(f"| CMA-ES | {len(history)} | 0 | {time.perf_counter() - begun:.0f} | " + errors_of(best), flush=True)
