@@ -252,7 +252,8 @@ def _check_contact(particles, config, contact):
             " contact=None."
         )
     if not isinstance(particles.body, jax.core.Tracer):
-        low, high = int(particles.body.min()), int(particles.body.max())
+        body = np.asarray(particles.body)  # known also where jit closes over it
+        low, high = int(body.min()), int(body.max())
         if low < 0 or high >= contact.bodies:
             bad = low if low < 0 else high
             raise InputError(f"Particles.body = {bad}: BodyContact has bodies 0 to {contact.bodies - 1}.")
