@@ -62,8 +62,8 @@ def test_levels_are_ordered_from_coarse_to_fine():
 
 
 def test_fields_of_the_file_win(values):
-    scene = scene_of(values, accuracy="draft", drawing={"sh_degree": 2})
-    assert scene.drawing.sh_degree == 2
+    scene = scene_of(values, accuracy="draft", drawing={"alpha_min": 0.5})
+    assert scene.drawing.alpha_min == 0.5
     assert scene.drawing.scale == LEVELS["draft"].defaults["drawing"]["scale"]
 
 
