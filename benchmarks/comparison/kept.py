@@ -16,5 +16,6 @@ def kept(folder: Path | None, name: str, make: Callable[[], Any]) -> Any:
         return pickle.loads(path.read_bytes())
     value = jax.tree.map(np.asarray, make())
     if path:
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(pickle.dumps(value))
     return value
