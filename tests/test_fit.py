@@ -1,5 +1,7 @@
 """Bounds, descent and search against known minima, and on the parameters of the simulator itself."""
 
+from collections import OrderedDict
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -268,3 +270,71 @@ def test_stiffness_speed_and_a_colliders_place_are_recovered_from_a_path():
     np.testing.assert_allclose(best["v0"], truth["v0"], atol=0.01)
     assert float(best["young"]) == pytest.approx(2e4, rel=0.03)
     assert float(best["height"]) == pytest.approx(0.3, abs=0.001)
+
+
+# Misuse and odd shapes of parameters
+
+
+@pytest.mark.parametrize("kind", [tuple, list, lambda pairs: OrderedDict(zip("ba", pairs))])
+def test_bounds_go_to_their_own_parameters(kind):
+    """Where the leaves are not in the order of sorted names, too."""
+    start, limits = kind([jnp.asarray(1.0), jnp.asarray(10.0)]), kind([(0.0, 2.0), (5.0, 50.0)])
+    best, _ = fit(lambda p: -sum(jax.tree.leaves(p)), start, 1.0, steps=60, bounds=limits)
+    np.testing.assert_allclose(jax.tree.leaves(best), [2.0, 50.0], rtol=1e-2)
+
+
+def test_a_range_too_narrow_for_its_precision_is_told():
+    with pytest.raises(InputError, match="must start between its bounds"):
+        fit(lambda x: x, jnp.float32(1000000.0625), 0.1, steps=2, bounds=Bounds(1e6, 1.001e6, "log"))
+
+
+@pytest.mark.parametrize(
+    ("options", "told"), [({"bounds": (-9.0, 9.0)}, "other bounds"), ({"clip": 1.0}, "other bounds")]
+)
+def test_a_checkpoint_of_other_settings_is_refused(tmp_path, options, told):
+    usual = {"steps": 4, "bounds": (-5.0, 5.0), "checkpoint": tmp_path / "c"}
+    fit(lambda x: (x - 1) ** 2, jnp.asarray(0.0), 0.1, **usual)
+    with pytest.raises(InputError, match="other bounds or settings"):
+        fit(lambda x: (x - 1) ** 2, jnp.asarray(0.0), 0.1, **usual | options)
+
+
+def test_a_search_with_other_bounds_is_another_one(tmp_path):
+    pytest.importorskip("cma")
+    usual = {"evaluations": 8, "checkpoint": tmp_path / "s"}
+    search(lambda x: (x - 1) ** 2, jnp.asarray(0.0), bounds=(-5.0, 5.0), **usual)
+    with pytest.raises(InputError, match="another search"):  # the middle of both is the same free number
+        search(lambda x: (x - 1) ** 2, jnp.asarray(0.0), bounds=(-9.0, 9.0), **usual)
+
+
+def test_a_finished_fit_stays_finished(tmp_path):
+    options = {"steps": 50, "patience": 3, "checkpoint": tmp_path / "c"}
+    _, first = fit(lambda x: x * 0, jnp.asarray(1.0), 0.1, **options)
+    _, again = fit(lambda x: x * 0, jnp.asarray(1.0), 0.1, **options)
+    assert (len(again), again.stop) == (len(first), "plateau")
+
+
+def test_search_goes_on_past_a_generation_that_breaks_down():
+    pytest.importorskip("cma")
+    calls = []
+
+    def host(p):
+        calls.append(float(p["b"]))
+        if 5 <= len(calls) <= 12:
+            raise SimulationError("it broke down")
+        assert (p["a"].dtype, p["b"].dtype) == (jnp.float32, jnp.float64)
+        return (p["a"] - 0.3) ** 2 + (p["b"] - 0.4) ** 2
+
+    with jax.enable_x64(True):
+        start = {"a": jnp.zeros((), jnp.float32), "b": jnp.zeros((), jnp.float64)}
+        best, history = search(host, start, evaluations=120, population=4, vectorize=False)
+    assert history.rejected == 8
+    np.testing.assert_allclose(history.parameters["b"], calls)  # also those that broke down, in full precision
+    np.testing.assert_allclose([best["a"], best["b"]], [0.3, 0.4], atol=0.02)
+
+
+@pytest.mark.parametrize("options", [{"steps": 0}, {"steps": 2, "every": 0}, {"steps": 2, "patience": 0}])
+def test_counts_below_one_are_told(options):
+    with pytest.raises(InputError, match="must be 1 or more"):
+        fit(bowl, START, 0.1, **options)
+    with pytest.raises(InputError, match="evaluations = 0"):
+        search(bowl, START, evaluations=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -59,7 +60,8 @@ class Bounds:
         room = _EDGE * (1.0 if low is None or high is None else np.asarray(high - low))
         below = low is not None and not np.all(at > low + room)
         above = high is not None and not np.all(at < high - room)
-        if below or above:
+        # a range may be narrower than its precision can tell
+        if below or above or not np.isfinite(self.to_free(jnp.asarray(value))).all():
             raise InputError(
                 f"{name} = {shown}: a search must start between its bounds {self.low} and {self.high}, not on them or"
                 " outside."
@@ -120,6 +122,13 @@ def bounds_of(bounds: Any, params: Any) -> list[Bounds]:
     found: list[Bounds] = []
 
     def spread(node: Any, part: Any, where: str) -> None:
+        each = isinstance(node, list | tuple) and isinstance(part, list | tuple)
+        if each and (isinstance(node, list) or any(isinstance(end, Bounds | tuple) for end in node)):
+            if len(node) != len(part):
+                raise InputError(f"bounds{where}: {len(node)} bounds for {len(part)} parameters.")
+            for k, (own, its) in enumerate(zip(node, part)):
+                spread(own, its, f"{where}.{k}")
+            return
         if node is None or isinstance(node, Bounds | tuple):
             own = Bounds() if node is None else Bounds(*node) if isinstance(node, tuple) else node
             found.extend([own] * len(jax.tree.leaves(part)))
@@ -129,7 +138,8 @@ def bounds_of(bounds: Any, params: Any) -> list[Bounds]:
                 raise InputError(
                     f"bounds{where}: {unknown[0]!r} is no parameter; these are {', '.join(map(str, part))}."
                 )
-            for name in sorted(part):  # as JAX orders the leaves of a dictionary
+            ordered = isinstance(part, OrderedDict)
+            for name in part if ordered else sorted(part):  # as JAX orders the leaves of a dictionary
                 spread(node.get(name), part[name], f"{where}.{name}")
             return
         leaves = jax.tree.leaves(node, is_leaf=lambda leaf: leaf is None or isinstance(leaf, Bounds | tuple))

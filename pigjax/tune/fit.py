@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable
 from functools import partial
@@ -70,18 +71,24 @@ def fit(
         restarts: from the best, after a plateau.
         shared: arrays that the loss needs, a pytree; what it closes over instead is compiled into the program.
         has_aux: see `loss`.
-        checkpoint: file that a killed search goes on from, bit for bit.
+        checkpoint: file that a killed search goes on from, bit for bit; it does not keep the scores of `has_aux`.
         every: steps between checkpoints.
 
     Returns:
         The best parameters met, and the history.
 
     Raises:
-        InputError: a start on or beyond its bounds, bounds for unknown parameters, or the checkpoint of another search.
+        InputError: a start on or beyond its bounds, bounds for unknown parameters, a count below 1, or the checkpoint
+            of another search.
         SimulationError: the loss is not finite at the start, or around the best parameters.
     """
+    for option, count in (("steps", steps), ("every", every), ("patience", 1 if patience is None else patience)):
+        if count < 1:
+            raise InputError(f"{option} = {count}: must be 1 or more.")
     names, leaves, limits, rebuild = flat_parameters(params, bounds)
-    descent = optax.adam(optimizer) if isinstance(optimizer, float | int) else optimizer
+    descent = optimizer if isinstance(optimizer, optax.GradientTransformation) else optax.adam(optimizer)
+    rate = None if descent is optimizer else float(optimizer)
+    mark = fingerprint(names, limits, rate, clip, patience, tolerance, restarts)
     if clip is not None:
         descent = optax.chain(optax.clip_by_global_norm(clip), descent)
 
@@ -104,10 +111,10 @@ def fit(
     recorder = Recorder(names, [np.shape(leaf) for leaf in leaves], steps)
     begun = 0
     if checkpoint is not None and Path(checkpoint).exists():
-        state, recorder, begun = _resumed(Path(checkpoint), state, recorder, leaves, steps)
-    used = [limit.from_free(leaf) for limit, leaf in zip(limits, state.free)]
-    stop = "steps"
-    for number in range(begun, steps):
+        state, recorder, begun = _resumed(Path(checkpoint), state, recorder, leaves, mark)
+    finished = patience is not None and state.stale >= patience
+    stop = "plateau" if finished else "steps"
+    for number in range(begun, begun if finished else steps):
         used = [limit.from_free(leaf) for limit, leaf in zip(limits, state.free)]
         value, aux, norm, moved, optimiser = step(state.free, state.optimiser, state.rate, shared)
         good = bool(jnp.isfinite(value) & jnp.isfinite(norm))
@@ -118,7 +125,7 @@ def fit(
         wanted = callback is not None and callback(told) is True
         last = ended or wanted or number + 1 == steps
         if checkpoint is not None and (last or (number + 1) % every == 0):
-            io.save_pytree(checkpoint, (np.asarray(number + 1), leaves, state, recorder.arrays()))
+            io.save_pytree(checkpoint, (np.asarray(number + 1), mark, leaves, state, recorder.arrays()))
         if ended or wanted:
             stop = "plateau" if ended else "callback"
             break
@@ -166,17 +173,27 @@ def _next(state, value, good, moved, optimiser, descent, patience, tolerance, re
     )
 
 
-def _resumed(path, state, recorder, leaves, steps):
-    like = (np.asarray(0), leaves, state, recorder.arrays())
-    number, start, state, arrays = io.load_pytree(path, like)
+def _resumed(path, state, recorder, leaves, mark):
+    like = (np.asarray(0), mark, leaves, state, recorder.arrays())
+    number, found, start, state, arrays = io.load_pytree(path, like)
     if any(not np.array_equal(old, new) for old, new in zip(start, leaves)):
         raise InputError(f"{path}: belongs to a search from another start; delete it, or choose another checkpoint.")
+    if not np.array_equal(found, mark):
+        raise InputError(
+            f"{path}: belongs to a search with other bounds or settings; delete it, or choose another checkpoint."
+        )
     recorder.restore(arrays, int(number))
     return state, recorder, int(number)
 
 
+def fingerprint(*settings: Any) -> np.ndarray:
+    """What tells the settings of a search from others, for its checkpoint."""
+    return np.frombuffer(hashlib.sha256(repr(settings).encode()).digest(), np.uint8)
+
+
 def _broken(names, used, value, norm):
-    at = ", ".join(f"{name} = {np.asarray(leaf).tolist()}" for name, leaf in zip(names, used))
+    shown = [np.asarray(leaf).tolist() if leaf.size <= 8 else f"array of {leaf.size} numbers" for leaf in used]
+    at = ", ".join(f"{name} = {value}" for name, value in zip(names, shown))
     return (
         f"the loss is {float(value):g} and its gradient {float(norm):g} at {at}: start elsewhere, narrow the bounds,"
         " take more substeps, or search without gradients."

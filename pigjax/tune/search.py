@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
+import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pigjax.errors import InputError, SimulationError
-from pigjax.tune.fit import flat_parameters
+from pigjax.tune.fit import fingerprint, flat_parameters
 from pigjax.tune.history import History, Recorder, Step
 
 _SPREAD = 0.5  # of the first candidates, in the unconstrained numbers
@@ -63,6 +64,8 @@ def search(
         import cma
     except ImportError:
         raise InputError("a search without gradients needs cma: pip install 'pigjax[search]'.") from None
+    if evaluations < 1:
+        raise InputError(f"evaluations = {evaluations}: must be 1 or more.")
     names, leaves, limits, rebuild = flat_parameters(params, bounds)
     free = [np.asarray(limit.to_free(leaf), float) for limit, leaf in zip(limits, leaves)]
     start = np.concatenate([leaf.ravel() for leaf in free])
@@ -70,20 +73,20 @@ def search(
 
     def values_of(vector):
         parts = jnp.split(vector, splits) if len(free) > 1 else [vector]
-        shaped = (part.reshape(leaf.shape) for part, leaf in zip(parts, leaves))
+        shaped = (part.reshape(leaf.shape).astype(leaf.dtype) for part, leaf in zip(parts, leaves))
         return [limit.from_free(leaf) for limit, leaf in zip(limits, shaped)]
 
-    def one(vector, shared):
-        values = values_of(vector)
-        return (loss(rebuild(values)) if shared is None else loss(rebuild(values), shared)), values
+    def loss_at(values, shared):
+        return loss(rebuild(values)) if shared is None else loss(rebuild(values), shared)
 
-    many = jax.jit(jax.vmap(one, (0, None))) if vectorize else None
+    many = jax.jit(jax.vmap(loss_at, (0, None))) if vectorize else partial(_one_by_one, loss_at)
+    spelled_out = jax.jit(jax.vmap(values_of))
     options: dict[str, Any] = {"seed": seed + 1, "verbose": -9, "maxfevals": np.inf}
     if population is not None:
         options["popsize"] = population
     # cma knows no single number: a second one, without any say, stands beside it
     padded = start if len(start) > 1 else np.append(start, 0.0)
-    key = hashlib.sha256(np.append(padded, [evaluations, spread, seed]).tobytes()).hexdigest()[:16]
+    key = fingerprint(names, limits, padded.tolist(), evaluations, spread, seed, population).tobytes()
     strategy, recorder, taken = cma.CMAEvolutionStrategy(padded, spread, options), None, 0
     size = strategy.popsize
     recorder = Recorder(names, [leaf.shape for leaf in leaves], -(-evaluations // size) * size)
@@ -91,16 +94,18 @@ def search(
         strategy, recorder, taken = _restored(Path(checkpoint), key)
     stop = "steps"
     while taken < evaluations:
-        candidates = strategy.ask()
-        vectors = jnp.asarray(np.stack(candidates)[:, : len(start)], leaves[0].dtype)
-        losses, values = many(vectors, shared) if many is not None else _one_by_one(one, vectors, shared)
-        losses = np.asarray(losses, float)
+        with warnings.catch_warnings():  # that a generation was not told
+            warnings.simplefilter("ignore", cma.evolution_strategy.InjectionWarning)
+            candidates = strategy.ask()
+        values = spelled_out(jnp.asarray(np.stack(candidates)[:, : len(start)]))
+        losses = np.asarray(many(values, shared), float)
         good = np.isfinite(losses)
         steps = [
             recorder.add(taken + k, losses[k], np.nan, [leaf[k] for leaf in values], bool(good[k])) for k in range(size)
         ]
-        worst = losses[good].max() if good.any() else 0.0
-        strategy.tell(candidates, np.where(good, losses, worst + 1 + abs(worst)))
+        if good.any():  # of a generation that broke down as a whole nothing is learnt: the next is drawn as it was
+            worst = losses[good].max()
+            strategy.tell(candidates, np.where(good, losses, worst + 1 + abs(worst)))
         taken += size
         if checkpoint is not None:
             _save(Path(checkpoint), key, strategy, recorder, taken)
@@ -119,39 +124,40 @@ def search(
     return rebuild(best), history
 
 
-def _one_by_one(one, vectors, shared):
-    losses, values = [], []
-    for vector in vectors:
+def _one_by_one(loss_at, values, shared):
+    losses = []
+    for k in range(len(values[0])):
         try:
-            value, leaves = one(vector, shared)
+            losses.append(float(loss_at([leaf[k] for leaf in values], shared)))
         except (InputError, SimulationError):
-            value, leaves = np.nan, None
-        losses.append(float(value))
-        values.append(leaves)
-    known = next((leaves for leaves in values if leaves is not None), None)
-    if known is None:
-        raise SimulationError("no candidate of the first generation could be evaluated: start elsewhere.")
-    blank = [np.full(np.shape(leaf), np.nan) for leaf in known]
-    return np.array(losses), [
-        np.stack([np.asarray(row[k]) for row in (v or blank for v in values)]) for k in range(len(known))
-    ]
+            losses.append(np.nan)
+    return losses
 
 
-def _save(path: Path, key: str, strategy: Any, recorder: Recorder, taken: int) -> None:
+def _save(path: Path, key: bytes, strategy: Any, recorder: Recorder, taken: int) -> None:
     import pickle
 
     from pigjax.io.files import writing
 
-    with writing(path) as partial:
-        partial.write_bytes(pickle.dumps((key, strategy, recorder, taken)))
+    with writing(path) as unfinished:
+        unfinished.write_bytes(pickle.dumps((key, strategy, recorder, taken)))
 
 
-def _restored(path: Path, key: str) -> tuple[Any, Recorder, int]:
+def _restored(path: Path, key: bytes) -> tuple[Any, Recorder, int]:
     import pickle
 
     try:
         found, strategy, recorder, taken = pickle.loads(path.read_bytes())
-    except (pickle.UnpicklingError, EOFError, ValueError, AttributeError, OSError) as error:
+    except (
+        pickle.UnpicklingError,
+        LookupError,
+        EOFError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        ImportError,
+        OSError,
+    ) as error:
         raise InputError(f"{path}: not a checkpoint of a search ({error}); delete it and run again.") from None
     if found != key:
         raise InputError(f"{path}: belongs to another search (start, bounds, evaluations or seed); delete it.")
