@@ -94,7 +94,7 @@ def report(truth, start, best, history, seconds):
 def one() -> None:
     made = made_from(extremes=[{"objects.duck.young": STIFF.high}])
     target = film(arrays(DUCK), made)
-    best, history, seconds = descend(made, target, DUCK_START)
+    best, history, seconds = descend(made, target, DUCK_START, steps=80)
     report(DUCK, DUCK_START, best, history, seconds)
     history.plot(MEDIA / "identification_one.png")
     rows = [np.asarray(film(arrays(values), made))[::2] for values in (DUCK, DUCK_START, best)]
