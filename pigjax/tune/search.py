@@ -94,9 +94,7 @@ def search(
         strategy, recorder, taken = _restored(Path(checkpoint), key)
     stop = "steps"
     while taken < evaluations:
-        with warnings.catch_warnings():  # that a generation was not told
-            warnings.simplefilter("ignore", cma.evolution_strategy.InjectionWarning)
-            candidates = strategy.ask()
+        candidates = strategy.ask()
         values = spelled_out(jnp.asarray(np.stack(candidates)[:, : len(start)]))
         losses = np.asarray(many(values, shared), float)
         good = np.isfinite(losses)
@@ -105,7 +103,9 @@ def search(
         ]
         if good.any():  # of a generation that broke down as a whole nothing is learnt: the next is drawn as it was
             worst = losses[good].max()
-            strategy.tell(candidates, np.where(good, losses, worst + 1 + abs(worst)))
+            with warnings.catch_warnings():  # that a generation before was not told
+                warnings.simplefilter("ignore", cma.evolution_strategy.InjectionWarning)
+                strategy.tell(candidates, np.where(good, losses, worst + 1 + abs(worst)))
         taken += size
         if checkpoint is not None:
             _save(Path(checkpoint), key, strategy, recorder, taken)
