@@ -10,19 +10,16 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 from _pages import run_parts
 from _timing import measure, use_host_devices
 
-use_host_devices()
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-
-from pigjax import io  # noqa: E402
-from pigjax.study import experiment, load_study  # noqa: E402
-from pigjax.study.objectives import objective_of  # noqa: E402
-from pigjax.tune import Bounds, fit, search  # noqa: E402
+from pigjax import io
+from pigjax.study import experiment, load_study
+from pigjax.study.objectives import objective_of
+from pigjax.tune import Bounds, fit, search
 
 STUDIES = Path(__file__).parents[1] / "examples" / "studies"
 MEDIA = Path(__file__).parents[1] / "docs" / "media"
@@ -138,4 +135,5 @@ PARTS = {
 }
 
 if __name__ == "__main__":
+    use_host_devices()
     run_parts("bench_control.py", "Control through contact", PARTS, __doc__)

@@ -11,20 +11,17 @@ import sys
 import time
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+import optax
 from _pages import run_parts
 from _timing import measure, use_host_devices
 
-use_host_devices()
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import msgspec  # noqa: E402
-import numpy as np  # noqa: E402
-import optax  # noqa: E402
-
-from pigjax import io  # noqa: E402
-from pigjax.study import Experiment, experiment, load_study  # noqa: E402
-from pigjax.tune import Bounds, fit, search  # noqa: E402
+from pigjax import io
+from pigjax.study import Experiment, experiment, load_study
+from pigjax.tune import Bounds, fit, search
 
 STUDIES = Path(__file__).parents[1] / "examples" / "studies"
 MEDIA = Path(__file__).parents[1] / "docs" / "media"
@@ -230,6 +227,7 @@ PARTS = {
 }
 
 if __name__ == "__main__":
+    use_host_devices()
     if sys.argv[1:] == ["video"]:
         video()
     else:

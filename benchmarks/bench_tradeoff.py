@@ -6,9 +6,9 @@ apart. `--write` replaces the sections of those parts in the page, and their plo
 """
 
 import argparse
-import re
 from pathlib import Path
 
+from _pages import replaced
 from _timing import machine, use_host_devices
 from tradeoff import drawing, matter, voting, whole
 from tradeoff.scenes import SCENES
@@ -20,16 +20,6 @@ PARTS = {
     "voting": ("Voting", voting.study),
     "whole": ("The whole pipeline", whole.study),
 }
-
-
-def replaced(page: str, title: str, text: str) -> str:
-    """The page with the printed part of a section replaced, or with the section added at its end."""
-    begin, end = f"<!-- {title}: printed -->", f"<!-- {title}: end -->"
-    section = f"{begin}\n\n{text}\n\n{end}"
-    pattern = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
-    if pattern.search(page):
-        return pattern.sub(lambda _: section, page)
-    return f"{page.rstrip()}\n\n## {title}\n\n{section}\n"
 
 
 def main():

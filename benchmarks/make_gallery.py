@@ -12,7 +12,7 @@ import imageio.v3 as iio
 import numpy as np
 from PIL import Image, ImageDraw
 
-from pigjax.cli import _one_device_per_core
+from pigjax.cli import one_device_per_core
 from pigjax.scene import load_scene, run_scene
 
 ROOT = Path(__file__).parents[1]
@@ -28,7 +28,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if unknown := set(arguments.names) - set(SCENES):
         parser.error(f"no scene of the name {', '.join(sorted(unknown))}: choose from {', '.join(SCENES)}")
-    _one_device_per_core()
+    one_device_per_core()
     for name in arguments.names or SCENES:
         print(run(name, arguments.out / name), flush=True)
     clips = {name: arguments.out / name / "video.mp4" for name in SCENES}

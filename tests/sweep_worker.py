@@ -4,15 +4,14 @@ import contextlib
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+
+from pigjax.tune import sweep
 
 port, folder, process = sys.argv[1], sys.argv[2], int(sys.argv[3])
 jax.config.update("jax_cpu_collectives_implementation", "gloo")
 jax.distributed.initialize(f"127.0.0.1:{port}", 2, process)
-
-import jax.numpy as jnp  # noqa: E402
-
-from pigjax.tune import sweep  # noqa: E402
 
 GRID = {"a": np.linspace(-1.0, 2.0, 5), "b": [0.5, 1.0, 4.0]}
 

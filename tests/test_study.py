@@ -18,7 +18,7 @@ from pigjax import io
 from pigjax.camera import look_at, stack_cameras
 from pigjax.cli import app
 from pigjax.errors import InputError, MissingFileError, SceneError
-from pigjax.scene import load_scene, run_scene
+from pigjax.scene import load_scene, run_scene, scene_from
 from pigjax.segmentation import lift_masks
 from pigjax.splat import RenderConfig, render
 from pigjax.study import Voting, experiment, load_study, sweep_study, tune_study
@@ -103,6 +103,13 @@ def test_density_makes_mass_and_gravity_points_down(made):
     np.testing.assert_allclose(heavy.particles.mass, 3 * made.particles.mass, rtol=1e-6)
     down = made.with_parameters({"simulation.gravity": 5.0}).gravity
     np.testing.assert_allclose(down, [0, 0, -5.0], atol=1e-6)
+
+
+def test_the_scenes_drawing_settings_are_kept(folder):
+    drawn = scene_from({**SCENE, "drawing": {"alpha_min": 0.02, "scale": 0.5}}, folder=folder)
+    made = experiment(drawn)
+    assert made.render.alpha_min == 0.02
+    assert made.cameras.width == SCENE["camera"]["width"] // 2
 
 
 def test_unknown_names_are_told_with_the_nearest_right_one(made):
@@ -222,6 +229,15 @@ def test_own_objectives_are_read_from_files(folder, tmp_path):
     path = study_file(folder, objective={"function": "own.py:low", "options": {"scale": 2.0}})
     table = sweep_study(load_study(path), tmp_path)
     assert np.all(np.diff(table["loss"]) != 0)
+
+
+def test_the_best_scene_holds_what_a_scene_file_can_say(folder, tmp_path):
+    study = load_study(study_file(folder, regions={"ball": 2}))
+    found = {"clamp.lambda_R": 0.5, "simulation.frame_dt": 0.01, "objects.ball.young": [1e3, 2e3]}
+    values = study.scene_values(found, tmp_path)
+    assert values["clamp"] == {"lambda_R": 0.5}
+    assert "frame_dt" not in values["simulation"]
+    assert values["objects"]["ball"]["young"] == 4000.0
 
 
 BAD = {

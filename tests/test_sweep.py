@@ -106,7 +106,10 @@ def test_memory_sizes_the_batch(monkeypatch):
         "__call__",
         lambda self, index, own=module._Program.__call__: sizes.append(self.size) or own(self, index),
     )
-    fn = lambda p: jnp.sort(jnp.sin(jnp.arange(64000.0) * p["a"]))[::7].sum()  # noqa: E731
+
+    def fn(p):
+        return jnp.sort(jnp.sin(jnp.arange(64000.0) * p["a"]))[::7].sum()
+
     table = sweep(fn, {"a": np.linspace(1, 2, 40)})
     assert max(sizes) < 40
     np.testing.assert_allclose(table["value"][11], fn({"a": np.linspace(1, 2, 40)[11]}), rtol=1e-3, atol=1e-2)

@@ -7,10 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
 
 
 class Point(NamedTuple):
@@ -74,9 +71,8 @@ def table(points: Sequence[Point], *, error: str, show: Callable[[float], str] =
 
 def plot(panels: dict[str, Sequence[Point]], path: Path, *, error: str, floors: dict[str, float] | None = None) -> None:
     """One panel per scene: settings coloured by knob, the Pareto set joined, floors of the error dashed."""
-    figure, axes = plt.subplots(
-        1, len(panels), figsize=(4.6 * len(panels), 4), layout="constrained", dpi=90, squeeze=False
-    )
+    figure = Figure(figsize=(4.6 * len(panels), 4), layout="constrained", dpi=90)
+    axes = figure.subplots(1, len(panels), squeeze=False)
     knobs = list(dict.fromkeys(point.knob for points in panels.values() for point in points))
     for axis, (title, points) in zip(axes[0], panels.items()):
         best = sorted((p for p in points if p.name in pareto(points)), key=lambda p: p.seconds)
@@ -94,4 +90,3 @@ def plot(panels: dict[str, Sequence[Point]], path: Path, *, error: str, floors: 
     axes[0, 0].set_ylabel(error)
     axes[0, -1].legend(fontsize=7)
     figure.savefig(path)
-    plt.close(figure)

@@ -8,7 +8,7 @@ experiment can be jitted, vmapped and differentiated.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -30,7 +30,7 @@ from pigjax.materials import Material, MaterialTable, Parameters
 from pigjax.matter import Grid, Health, Particles, Trajectory, fit_grid, vast_grid
 from pigjax.mls_mpm import SimConfig, choose_integrator, choose_substeps, rollout, stable_dt
 from pigjax.particles import Binding, at_frame, deform
-from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, segment
+from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, render_config, segment
 from pigjax.scene.schema import Scene, suggest
 from pigjax.splat import Gaussians, RenderConfig, Splats, render
 
@@ -228,7 +228,6 @@ def experiment(
     regions: Mapping[str, int] | None = None,
     margin: float = 0.1,
     alone: bool = False,
-    edit: Callable[[Plan, Inputs], Plan] | None = None,
 ) -> Experiment:
     """Read a scene and make an experiment of it. Host.
 
@@ -243,7 +242,6 @@ def experiment(
             part; rows of the table, which cost nothing more.
         margin: room around the motion [m].
         alone: leave out the Gaussians of objects that the scene does not name; otherwise they are drawn as they stand.
-        edit: last changes to what will be simulated.
 
     Raises:
         InputError: a file is missing or damaged, or the scene asks for something that cannot be.
@@ -256,8 +254,6 @@ def experiment(
         plan = make_plan(scene, inputs, segment(scene, inputs))
     if alone:
         inputs, plan = _only_named(inputs, plan)
-    if edit is not None:
-        plan = edit(plan, inputs)
     made = _assemble(scene, inputs, plan)
     for name, count in (regions or {}).items():
         made = _split_object(made, name, count)
@@ -300,7 +296,7 @@ def _assemble(scene: Scene, inputs: Inputs, plan: Plan) -> Experiment:
         cameras=make_cameras(scene, inputs, np.asarray(plan.particles.x).mean(0)),
         background=jnp.asarray(camera.background, dtype),
         config=plan.config,
-        render=RenderConfig(),
+        render=replace(render_config(scene), bands=1),  # devices share rows of a sweep, or particles
         mode=scene.clamp.mode,
         frames=spec.frames,
         rows=tuple((name, (row,)) for row, name in enumerate(moving)),

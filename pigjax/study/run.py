@@ -107,9 +107,7 @@ def _trial(study: Study, rows: Sequence[Row], *, soft: bool) -> tuple[Callable[.
         temperature = study.objective.options.get("temperature", _SOFT_VOTES if soft else None)
         if study.objective.function != "votes":
             raise SceneError("objective.function: thresholds of the vote are scored by 'votes'.")
-        return lambda values, shared: shared[0].with_parameters(values).scores(), (
-            voting(scene, temperature=temperature),
-        )
+        return _score_votes, (voting(scene, temperature=temperature),)
     if any(of_votes):
         raise SceneError("parameters: thresholds of the vote decide what is simulated: study them apart from the rest.")
     made = experiment(scene, extremes=_ends(study, rows), regions=study.regions, alone=study.only is not None)
@@ -119,6 +117,10 @@ def _trial(study: Study, rows: Sequence[Row], *, soft: bool) -> tuple[Callable[.
     only_drawn = all(name.startswith("clamp.") for name in study.parameters)
     outcome = jax.jit(Experiment.simulate)(made) if only_drawn else None
     return partial(_score, objective), (made, outcome)
+
+
+def _score_votes(values: Row, shared: tuple[Voting]) -> Scores:
+    return shared[0].with_parameters(values).scores()
 
 
 def _score(objective: Objective, values: Row, shared: tuple[Experiment, Outcome | None]) -> Scores:

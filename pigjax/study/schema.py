@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import copy
 import os
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -98,12 +100,15 @@ class Study(Struct, forbid_unknown_fields=True, frozen=True):
     def scene_values(self, parameters: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         """Contents of a scene file in another folder, with these parameters.
 
-        Left out are the numbers of an object's parts, which a scene file has no place for.
+        Left out is what a scene file has no place for: numbers of an object's parts, the time between frames.
         """
         values = self._values()
         for name, value in parameters.items():
-            if not (isinstance(value, list) and name.split(".")[1] in self.regions):
-                _put(values, name, value)
+            changed = copy.deepcopy(values)
+            _put(changed, name, value)
+            with contextlib.suppress(SceneError):
+                scene_from(changed)
+                values = changed
         here = Path(self.folder) / Path(self.scene).parent
         for name in ("gaussians", "views", "masks", "names"):
             if name in values["input"]:

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
+from pigjax.io.files import writing
+
 
 class Step(NamedTuple):
     """One step, as a callback is told it."""
@@ -50,8 +52,6 @@ class History:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all of it as `.npz`. Host."""
-        from pigjax.io.files import writing
-
         named: dict[str, Any] = {f"parameters/{name}": values for name, values in self.parameters.items()}
         named |= {f"scores/{name}": values for name, values in self.scores.items()}
         own = {name: getattr(self, name) for name in ("loss", "gradient", "good", "seconds", "stop")}

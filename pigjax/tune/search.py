@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import warnings
 from collections.abc import Callable
 from functools import partial
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pigjax.errors import InputError, SimulationError
+from pigjax.io.files import writing
 from pigjax.tune.fit import fingerprint, flat_parameters
 from pigjax.tune.history import History, Recorder, Step
 
@@ -135,17 +137,11 @@ def _one_by_one(loss_at, values, shared):
 
 
 def _save(path: Path, key: bytes, strategy: Any, recorder: Recorder, taken: int) -> None:
-    import pickle
-
-    from pigjax.io.files import writing
-
     with writing(path) as unfinished:
         unfinished.write_bytes(pickle.dumps((key, strategy, recorder, taken)))
 
 
 def _restored(path: Path, key: bytes) -> tuple[Any, Recorder, int]:
-    import pickle
-
     try:
         found, strategy, recorder, taken = pickle.loads(path.read_bytes())
     except (

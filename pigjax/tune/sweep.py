@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import os
+import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -165,8 +166,6 @@ class _Keep:
 
 def _told_by_first(found: dict[int, dict[str, np.ndarray]]) -> dict[int, dict[str, np.ndarray]]:
     """The first process's finished rows, in every process."""
-    import pickle
-
     sent = np.frombuffer(pickle.dumps(found), np.uint8)
     size = int(multihost_utils.broadcast_one_to_all(np.int32(len(sent))))
     room = np.zeros(size, np.uint8)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Shaped
 
 from pigjax.errors import InputError, MissingFileError
+from pigjax.io.files import writing
 
 Columns = Mapping[str, Shaped[np.ndarray, "..."]]
 PathLike = str | os.PathLike[str]
@@ -63,7 +64,8 @@ class Table:
         Raises:
             InputError: the column is unknown or no single number, or no row is good.
         """
-        return {key: column[self.best_row(name, mode=mode)] for key, column in self.parameters.items()}
+        row = self.best_row(name, mode=mode)
+        return {key: column[row] for key, column in self.parameters.items()}
 
     def best_row(self, name: str, *, mode: Literal["min", "max"] = "min") -> int:
         """Number of that row.
@@ -98,8 +100,6 @@ class Table:
         Raises:
             InputError: unknown suffix, pyarrow is missing, or the file cannot be written.
         """
-        from pigjax.io.files import writing
-
         write = {".npz": self._write_npz, ".csv": self._write_csv, ".parquet": self._write_parquet}
         suffix = Path(path).suffix.lower()
         if suffix not in write:

@@ -1,0 +1,39 @@
+"""What the commands share: the console, progress bars, devices."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+console = Console(stderr=True)
+_MOST_DEVICES = 8  # an image has too few rows of tiles for more
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")]
+
+
+def one_device_per_core() -> None:
+    """On a CPU, XLA runs loops on one core per device; images and simulations are shared among them."""
+    import jax
+
+    if "JAX_NUM_CPU_DEVICES" not in os.environ and "XLA_FLAGS" not in os.environ:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        jax.config.update("jax_num_cpu_devices", min(cores, _MOST_DEVICES))
+
+
+@contextmanager
+def progress(*columns: str) -> Iterator[Progress]:
+    """Progress bar with time left."""
+    texts = [TextColumn(column) for column in ("{task.description:<12}", *columns)]
+    bar = Progress(
+        texts[0], BarColumn(), MofNCompleteColumn(), *texts[1:], TimeElapsedColumn(), TimeRemainingColumn(),
+        console=console,
+    )  # fmt: skip
+    with bar:
+        yield bar

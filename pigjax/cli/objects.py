@@ -1,0 +1,193 @@
+"""Commands from photos to objects: reconstruct, segment, evaluate."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.progress import TaskID
+from rich.table import Table
+
+from pigjax.cli.base import Out, app, console, one_device_per_core, progress
+
+TauT = Annotated[float, typer.Option(help="Transmittance that marks the surface.", min=0, max=1)]
+TauD = Annotated[float, typer.Option(help="Relative depth tolerance of a vote.", min=0, max=1)]
+Weighting = Annotated[str, typer.Option(help="centre: the paper's vote; alpha: credit by alpha·T.")]
+Purity = Annotated[float, typer.Option(help="Least share of the votes to be of an object.", min=0, max=1)]
+MinSeen = Annotated[
+    float | None, typer.Option(help="With --weighting alpha: least share of a Gaussian that views see.", min=0, max=1)
+]
+Fill = Annotated[bool, typer.Option(help="Give unseen Gaussians the id of their neighbours; not with --min-seen.")]
+
+
+@app.command()
+def reconstruct(
+    views: Annotated[Path, typer.Argument(help="transforms.json, cameras.json, COLMAP model, or their folder.")],
+    out: Out = Path("reconstruction"),
+    steps: Annotated[int, typer.Option(help="Optimisation steps.", min=1)] = 3000,
+    splats: Annotated[int, typer.Option(help="Number of Gaussians.", min=4)] = 15_000,
+    sh_degree: Annotated[int, typer.Option(help="Bands of view-dependent colour.", min=0, max=3)] = 1,
+    background: Annotated[float, typer.Option(help="Grey level behind the scene: 0 black, 1 white.")] = 0.0,
+    max_size: Annotated[int | None, typer.Option(help="Shrink photos to this many pixels.")] = None,
+    start_splats: Annotated[
+        int | None, typer.Option(help="Begin with fewer Gaussians and double them during the first half.", min=4)
+    ] = None,
+    only: Annotated[int | None, typer.Option(help="Fit only what the masks give this id.")] = None,
+    random_background: Annotated[bool, typer.Option(help="A new colour each step behind what masks cover.")] = False,
+    refine_poses: Annotated[bool, typer.Option(help="Correct training cameras, into OUT/poses.json.")] = False,
+    previews: Annotated[int, typer.Option(help="Steps between preview pictures; 0 for none.", min=0)] = 0,
+    seed: int = 0,
+) -> None:
+    """Fit Gaussians to photos; writes OUT/gaussians.ply, and goes on from OUT/checkpoint if it was stopped."""
+    one_device_per_core()
+    import jax
+
+    from pigjax import io
+    from pigjax.reconstruct import FitConfig, reconstruct
+    from pigjax.reconstruct import Progress as Step
+    from pigjax.splat import RenderConfig
+
+    needs_masks = only is not None or random_background
+    doublings = max(math.ceil(math.log2(splats / start_splats)), 1) if start_splats else 1
+    loaded = io.load_views(views, masks=needs_masks, max_size=max_size, background=background)
+    points = io.load_points(loaded.points_path) if loaded.points_path else None
+    config = FitConfig(
+        steps=steps,
+        splats=splats,
+        start_splats=start_splats,
+        grow_every=max(steps // (2 * doublings), 1),
+        sh_degree=sh_degree,
+        background=background,
+        object_id=only,
+        random_background=random_background,
+        pose_rate=5e-4 if refine_poses else 0.0,
+        preview_every=previews,
+        seed=seed,
+        render=RenderConfig(bands=jax.local_device_count()),
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    with progress("{task.fields[state]}") as bar:
+        task, last = bar.add_task("reconstruct", total=steps, state=""), [""]
+
+        def tell(step: Step) -> None:
+            last[0] = last[0] if step.psnr is None else f"  held-out {step.psnr:.2f} dB"
+            bar.update(task, completed=step.step, state=f"loss {step.loss:.4f}{last[0]}")
+
+        result = reconstruct(
+            loaded, config, points=points, checkpoint=out / "checkpoint", previews=out / "previews", callback=tell
+        )
+    ply = out / "gaussians.ply"
+    io.save_ply(ply, result.gaussians)
+    if refine_poses:
+        poses = dict(zip(result.trained_on, result.cameras.world_to_cam.tolist()))
+        io.write_json(out / "poses.json", {"world_to_cam": poses})
+    io.write_json(out / "report.json", {"psnr": result.psnr, "ssim": result.ssim, "mean_psnr": result.mean_psnr,
+                                        "history": [step._asdict() for step in result.history]})  # fmt: skip
+    table = Table("held-out view", "PSNR dB", "SSIM")
+    for name in result.psnr:
+        table.add_row(name, f"{result.psnr[name]:.2f}", f"{result.ssim[name]:.4f}")
+    console.print(table)
+    console.print(
+        f"mean PSNR {result.mean_psnr:.2f} dB, SSIM {result.mean_ssim:.4f}; {out / 'gaussians.ply'}", highlight=False
+    )
+
+
+def _settings(tau_t: float, tau_d: float, weighting: str, purity: float, min_seen: float | None) -> dict[str, Any]:
+    """Of the vote; what competes with objects by alpha·T is the background too."""
+    background = "vote" if weighting == "alpha" else "ignore"
+    thresholds = {"tau_T": tau_t, "tau_d": tau_d, "purity": purity, "min_seen": min_seen}
+    return {**thresholds, "weighting": weighting, "background": background}
+
+
+@app.command()
+def segment(
+    gaussians: Annotated[Path, typer.Argument(help="Trained .ply, .splat or .spz.")],
+    views: Annotated[Path, typer.Argument(help="Posed photos with a folder object_mask beside them.")],
+    out: Out = Path("segments"),
+    masks: Annotated[Path | None, typer.Option(help="Folder of masks, if it lies elsewhere.")] = None,
+    names: Annotated[Path | None, typer.Option(help="JSON of mask ids and names.")] = None,
+    tau_t: TauT = 0.5,
+    tau_d: TauD = 0.03,
+    weighting: Weighting = "centre",
+    purity: Purity = 0.0,
+    min_seen: MinSeen = None,
+    fill: Fill = True,
+    remove: Annotated[list[str] | None, typer.Option(help="Object to leave out, by name or id; repeat it.")] = None,
+) -> None:
+    """Lift masks to the Gaussians; writes labels, one .ply per object, and a sheet that shows which id is which.
+
+    With --remove also the scene without an object, and the hole that it leaves in every view.
+    """
+    from pigjax import io
+    from pigjax.scene.objects import segment_files
+
+    cloud = io.load_gaussians(gaussians)
+    loaded = io.load_views(views, masks=masks if masks is not None else True)
+    known = {} if names is None else {int(k): str(v) for k, v in io.read_json(names).items()}
+    settings = _settings(tau_t, tau_d, weighting, purity, min_seen)
+    counts = segment_files(cloud, loaded, known, out, fill=fill, remove=remove or (), **settings)
+    table = Table("id", "object", "Gaussians")
+    for number, count in counts.items():
+        table.add_row(str(number), known.get(number, "never seen" if number < 0 else ""), str(count))
+    console.print(table)
+    console.print(f"written to {out}", highlight=False, markup=False)
+
+
+@app.command()
+def evaluate(
+    dataset: Annotated[Path, typer.Argument(help="Folder of a labelled scene.")],
+    gaussians: Annotated[Path, typer.Argument(help="Trained .ply, .splat or .spz of it.")],
+    layout: Annotated[str, typer.Option("--format", help="lerf-mask, 3d-ovs, or views.")],
+    out: Out = Path("evaluation"),
+    masks: Annotated[Path | None, typer.Option(help="Folder or JSON of the masks to lift, if not object_mask.")] = None,
+    labels: Annotated[Path | None, typer.Option(help="labels.npz of 'pigjax segment', instead of lifting.")] = None,
+    prompts: Annotated[Path | None, typer.Option(help="JSON {prompt: id}.")] = None,
+    reference: Annotated[str | None, typer.Option(help="View whose truth gives each prompt its object.")] = None,
+    tau_t: TauT = 0.5,
+    tau_d: TauD = 0.03,
+    weighting: Weighting = "centre",
+    purity: Purity = 0.0,
+    min_seen: MinSeen = None,
+    fill: Fill = True,
+    holes: Annotated[int, typer.Option(help="Close holes of up to this many pixels in the masks.", min=0)] = 0,
+    max_size: Annotated[int | None, typer.Option(help="Shrink photos to this many pixels.")] = None,
+) -> None:
+    """Score objects against true masks (mIoU, mBIoU); writes OUT/scores.json and OUT/sheet.png."""
+    from pigjax import io
+    from pigjax.scene.evaluate import evaluate_files
+
+    cloud = io.load_gaussians(gaussians)
+    read = io.load_dataset(dataset, layout, masks=masks, vote=labels is None, max_size=max_size, holes=holes)
+    with progress() as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def tell(stage: str, done: int, of: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=of)
+            bar.update(tasks[stage], completed=done)
+
+        report = evaluate_files(
+            cloud, read, out, labels=labels, prompts=prompts, reference=reference,
+            fill=fill, progress=tell, **_settings(tau_t, tau_d, weighting, purity, min_seen),
+        )  # fmt: skip
+    scores = report.evaluation.scores
+    table = Table("prompt", "object", "views", *(f"{level} mIoU / mBIoU %" for level in scores))
+    for prompt, number in report.evaluation.objects.items():
+        cells = [_percent(*score.per_prompt[prompt]) for score in scores.values()]
+        table.add_row(escape(prompt), "missing" if number is None else str(number), str(report.views[prompt]), *cells)
+    table.add_section()
+    table.add_row("mean", "", "", *(_percent(score.mean_iou, score.mean_boundary_iou) for score in scores.values()))
+    console.print(table)
+    missing = next(iter(scores.values())).missing
+    console.print(
+        f"prompts by {report.grounding}; {missing} masks missing, scored 0; {len(report.black)} black ones left out;"
+        f" written to {out}",
+        highlight=False, markup=False,
+    )  # fmt: skip
+
+
+def _percent(iou: float, boundary_iou: float) -> str:
+    return f"{100 * iou:.1f} / {100 * boundary_iou:.1f}"

@@ -1,0 +1,113 @@
+"""Commands that simulate and draw: demo, run, view, info."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.progress import TaskID
+from rich.table import Table
+
+from pigjax.cli.base import Out, app, console, one_device_per_core, progress
+from pigjax.errors import InputError
+
+AccuracyOption = Annotated[
+    str | None, typer.Option("--accuracy", help="draft, standard or reference, instead of the scene file's.")
+]
+
+
+def example_folder() -> Path:
+    """The bundled tabletop scene: in the installed package, or in the checkout of an editable install."""
+    for root in (resources.files("pigjax"), Path(__file__).parents[2]):
+        folder = Path(str(root)) / "examples" / "tabletop"
+        if (folder / "scene.toml").is_file():
+            return folder
+    raise InputError("the bundled example examples/tabletop is missing; install pigjax again.")
+
+
+@app.command()
+def demo(out: Out = Path("pigjax-demo"), accuracy: AccuracyOption = None) -> None:
+    """Simulate the bundled tabletop scene and leave a video."""
+    _run(example_folder() / "scene.toml", out, accuracy)
+
+
+@app.command()
+def run(
+    scene: Annotated[Path, typer.Argument(help="Scene file (.toml).")],
+    out: Out = Path("out"),
+    accuracy: AccuracyOption = None,
+) -> None:
+    """Simulate a scene and draw its video; a killed run goes on from its last frame."""
+    _run(scene, out, accuracy)
+
+
+def _run(path: Path, out: Path, accuracy: str | None) -> None:
+    one_device_per_core()
+    from pigjax.scene import load_scene, run_scene
+
+    scene = load_scene(path, accuracy=accuracy)
+    with progress() as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def tell(stage: str, done: int, of: int) -> None:
+            for other, task in tasks.items():
+                if other != stage:
+                    bar.update(task, completed=bar.tasks[task].total)
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=of)
+            bar.update(tasks[stage], completed=done, total=of)
+
+        report = run_scene(scene, out, progress=tell)
+    table = Table("stage", "run s", "compile s")
+    for name, spent in report.times.items():
+        table.add_row(name, f"{spent.run:.1f}", f"{spent.compile:.1f}")
+    console.print(table)
+    sizes = report.sizes
+    console.print(
+        f"{sizes['gaussians']} Gaussians, {sizes['particles']} particles of {', '.join(report.modelled['laws'])};"
+        f" {sizes['frames']} frames of {sizes['substeps_per_frame']} substeps"
+    )
+    for warning in report.warnings:
+        console.print(f"[yellow]note:[/] {escape(str(warning))}", highlight=False)
+    console.print(f"video: {report.files['video']}", highlight=False, markup=False)
+
+
+@app.command()
+def view(
+    path: Annotated[Path, typer.Argument(help="A .ply, .splat or .spz.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Video (.mp4, .gif), or one picture (.png).")] = Path(
+        "view.mp4"
+    ),
+    frames: Annotated[int, typer.Option(help="Frames of one round.", min=1)] = 48,
+    size: Annotated[int, typer.Option(help="Edge of the pictures in pixels.", min=16)] = 480,
+    elevation: Annotated[float, typer.Option(help="Of the camera, in degrees.", min=-89, max=89)] = 25.0,
+    up: Annotated[str, typer.Option(help="Axis of the world that points up: x, y, z, -x, -y, -z.")] = "z",
+    background: Annotated[float, typer.Option(help="Grey level behind the scene: 0 black, 1 white.")] = 1.0,
+) -> None:
+    """Draw a file from all around."""
+    one_device_per_core()
+    from pigjax import io
+    from pigjax.scene.turntable import turntable
+
+    cloud = io.load_gaussians(path)
+    with progress() as bar:
+        task = bar.add_task("view", total=frames)
+        turntable(
+            cloud, out, frames=frames, size=size, elevation=elevation, up=up, background=background,
+            progress=lambda done, of: bar.update(task, completed=done, total=of),
+        )  # fmt: skip
+    console.print(f"written to {out}", highlight=False, markup=False)
+
+
+@app.command()
+def info(path: Annotated[Path, typer.Argument(help="A .ply, .splat or .spz, a scene file, or posed photos.")]) -> None:
+    """Say what a file holds."""
+    from pigjax.scene.objects import describe_file
+
+    table = Table(show_header=False)
+    for name, value in describe_file(path).items():
+        table.add_row(name, value)
+    console.print(table)
