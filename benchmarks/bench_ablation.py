@@ -5,7 +5,6 @@ parts (`ablation.reference`); then sweeps of lambda_R × lambda_S and of tau_max
 replaces the scenes' sections of the page, and their pictures in docs/media.
 """
 
-import argparse
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -14,8 +13,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _pages import replaced
-from _timing import machine, measure
+from _pages import run_parts
+from _timing import measure
 from ablation.pictures import write_heat, write_row
 from ablation.reference import EXACT, render_parts, split
 from ablation.scenes import Subject, subjects
@@ -160,20 +159,13 @@ def sweeps(subject: Subject, case: Case, media: Path | None) -> list[str]:
     return lines
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="scene", help="bent, pressed, drawn; all if none is given")
-    parser.add_argument("--pixels", type=int, default=192)
-    parser.add_argument("--write", type=Path, help="page whose sections are replaced")
-    options = parser.parse_args()
-    for subject in subjects(tuple(options.names) or ("bent", "pressed", "drawn")):
-        command = f"`python benchmarks/bench_ablation.py {subject.name}`, {machine()}"
-        text = f"{command}\n\n{study(subject, options.pixels, MEDIA if options.write else None)}"
-        print(f"\n## {subject.name}\n\n{text}", flush=True)
-        if options.write:
-            page = options.write.read_text() if options.write.exists() else "# The clamp's ablation\n"
-            options.write.write_text(replaced(page, subject.name, text))
+def part(name, options):
+    (subject,) = subjects((name,))
+    return study(subject, options.pixels, MEDIA if options.write else None)
 
+
+PARTS = {name: (name, partial(part, name)) for name in ("bent", "pressed", "drawn")}
 
 if __name__ == "__main__":
-    main()
+    pixels = {"type": int, "default": 192, "help": "width and height of pictures"}
+    run_parts("bench_ablation.py", "The clamp's ablation", PARTS, __doc__, pixels=pixels)

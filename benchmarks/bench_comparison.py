@@ -11,13 +11,14 @@ import functools
 from pathlib import Path
 
 import numpy as np
+from _pages import replaced
 from _timing import machine
-from bench_segmentation import MEDIA, replaced
 from comparison.kept import kept
 from comparison.methods import all_methods
 from comparison.setting import make_setting
 from comparison.study import HEADER, Truth, draw_rows, pictures, row
 
+MEDIA = Path(__file__).parents[1] / "docs/media"
 TITLE, PICTURE = "Table", "comparison.jpg"
 
 

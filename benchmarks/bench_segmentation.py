@@ -6,11 +6,10 @@ sections of those parts in the page, and their plots in docs/media. The cloud wi
 points.ids.npy), `--ply` reconstructions to score in part trained.
 """
 
-import argparse
+from functools import cache
 from pathlib import Path
 
-from _pages import replaced
-from _timing import machine
+from _pages import run_parts
 from segmentation import association, comparison, memory, noise, sweep, trained, votes
 from segmentation.tabletop import EXAMPLE, load_tabletop
 
@@ -19,7 +18,7 @@ from pigjax.io import load_ply
 MEDIA = Path(__file__).parents[1] / "docs/media"
 
 
-def compare(scene, options):
+def compare(scene, _):
     """Ours and rivals' methods re-made on the same renderer, views and scores"""
     bundled = load_ply(EXAMPLE / "tabletop.ply")
     on_trained = comparison.study(bundled, scene.train, scene.test, scene.names, MEDIA)
@@ -28,7 +27,7 @@ def compare(scene, options):
     return f"Trained scene:\n\n{on_trained}\n\n{picture}\n\nCloud with known ids:\n\n{on_cloud}"
 
 
-PARTS = {
+STUDIES = {
     "votes": ("Votes on a cloud with known ids", lambda scene, _: votes.study(scene)),
     "trained": ("Objects of a reconstructed scene", lambda scene, options: trained.study(scene, options.ply)),
     "comparison": ("Beside rivals' methods", compare),
@@ -46,24 +45,13 @@ PARTS = {
     ),
     "memory": ("Memory of a large vote", lambda *_: f"{memory.HEADER}\n{memory.study()}"),
 }
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", metavar="part", help=", ".join(PARTS))
-    parser.add_argument("--folder", type=Path, help="another tabletop")
-    parser.add_argument("--ply", type=Path, nargs="*", default=[], help="reconstructions of part trained")
-    parser.add_argument("--write", type=Path, help="page whose sections are replaced")
-    options = parser.parse_args()
-    scene = load_tabletop(options.folder)
-    for name in options.parts or PARTS:
-        title, study = PARTS[name]
-        text = f"`python benchmarks/bench_segmentation.py {name}`, {machine()}\n\n{study(scene, options)}"
-        print(f"\n## {title}\n\n{text}", flush=True)
-        if options.write:
-            page = options.write.read_text() if options.write.exists() else "# Segmentation\n"
-            options.write.write_text(replaced(page, title, text))
-
+read = cache(load_tabletop)
+PARTS = {
+    name: (title, lambda options, study=study: study(read(options.folder), options))
+    for name, (title, study) in STUDIES.items()
+}
 
 if __name__ == "__main__":
-    main()
+    folder = {"type": Path, "help": "another tabletop"}
+    ply = {"type": Path, "nargs": "*", "default": [], "help": "reconstructions of part trained"}
+    run_parts("bench_segmentation.py", "Segmentation", PARTS, __doc__, folder=folder, ply=ply)

@@ -5,40 +5,21 @@ bundled tabletop, a jelly cube and a cube of sand (`--scenes`). Times are median
 apart. `--write` replaces the sections of those parts in the page, and their plots in docs/media.
 """
 
-import argparse
 from pathlib import Path
 
-from _pages import replaced
-from _timing import machine, use_host_devices
+from _pages import run_parts
+from _timing import use_host_devices
 from tradeoff import drawing, matter, voting, whole
 from tradeoff.scenes import SCENES
 
 MEDIA = Path(__file__).parents[1] / "docs/media"
+STUDIES = {"Matter": matter, "Drawing": drawing, "Voting": voting, "The whole pipeline": whole}
 PARTS = {
-    "matter": ("Matter", matter.study),
-    "drawing": ("Drawing", drawing.study),
-    "voting": ("Voting", voting.study),
-    "whole": ("The whole pipeline", whole.study),
+    module.__name__.rpartition(".")[2]: (title, lambda options, study=module.study: study(MEDIA, options.scenes))
+    for title, module in STUDIES.items()
 }
 
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", metavar="part", help=", ".join(PARTS))
-    parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=SCENES)
-    parser.add_argument("--write", type=Path, help="page whose sections are replaced")
-    options = parser.parse_args()
-    use_host_devices()
-    for name in options.parts or PARTS:
-        title, study = PARTS[name]
-        scenes = "" if options.scenes == list(SCENES) else f" --scenes {' '.join(options.scenes)}"
-        said = study(MEDIA, options.scenes)
-        text = f"`python benchmarks/bench_tradeoff.py {name}{scenes}`, {machine()}\n\n{said}"
-        print(f"\n## {title}\n\n{text}", flush=True)
-        if options.write:
-            page = options.write.read_text() if options.write.exists() else "# Speed against accuracy\n"
-            options.write.write_text(replaced(page, title, text))
-
-
 if __name__ == "__main__":
-    main()
+    use_host_devices()
+    scenes = {"nargs": "*", "default": list(SCENES), "choices": SCENES}
+    run_parts("bench_tradeoff.py", "Speed against accuracy", PARTS, __doc__, scenes=scenes)

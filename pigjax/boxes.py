@@ -1,17 +1,20 @@
-"""The part of the grid that a simulation needs, fitted anew from frame to frame (host).
+"""The part of the grid that a simulation needs, laid anew from frame to frame.
 
-The same matter costs the same in a small domain and in a vast one. A box whose edge matter has reached means that
-the frame is computed again in a larger one.
+The same matter costs the same in a small domain and in a vast one. On the host a box whose edge matter has reached
+means that the frame is computed again in a larger one; inside jit, grad and vmap its size is fixed (`SimConfig.box`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Float
 
 from pigjax.errors import SimulationError
@@ -22,7 +25,9 @@ from pigjax.matter import Grid, Health, Particles, SimConfig, Trajectory
 _SMALL = 50_000  # nodes that need no box: less than other costs of a step
 _LARGEST = 200_000_000  # nodes
 _ROOM = 1.3  # a box is made so much longer than it must be: another size is another compilation
+_ROOM_OF_ONE = 1.15  # the same of a box of fixed size, for what is faster than what was seen
 _UNIT = 4  # nodes, of which sides are multiples
+_AROUND = 2  # cells of a box of fixed size around where matter is seen and is heading
 _PER_DEVICE = 4096  # particles that are worth a device of their own
 
 
@@ -60,6 +65,88 @@ def run_in_boxes(
             break
     joined = jax.tree.map(lambda *pieces: jnp.concatenate(pieces), *paths)
     return particles, joined, _worst(healths)
+
+
+def run_in_one_box(
+    particles: Particles,
+    domain: Grid,
+    table: MaterialTable,
+    config: SimConfig,
+    *,
+    frames: int,
+    **step,
+) -> tuple[Particles, Trajectory, Health]:
+    """The same inside jit, grad and vmap: a box of `config.box` nodes, or the whole domain, moves with the particles.
+
+    What is faster than a box allows is held back at its edge and counted as escaped.
+    """
+    devices = devices_for(config, len(particles))
+    shape = None if config.box is None else tuple(map(min, config.box, domain.shape))
+    if shape is None or shape == domain.shape:
+        start = jnp.zeros_like(step["dt"])
+        return run_frames(particles, whole(domain), table, config, devices, start=start, frames=frames, **step)[:3]
+    duration = step["dt"] * step["substeps"]
+
+    def frame(carry, number):
+        before, stopped = carry
+        box = _box_around(before, domain, shape, duration, step["gravity"])
+        after, path, health, _ = run_frames(
+            before, box, table, config, devices, start=duration * number, frames=1, of=frames, **step
+        )
+        bad = health.first_bad_frame >= 0
+        if config.stop:  # the last good frame to the digit, where a box's origin would round it anew
+            stopped = stopped | bad
+            after = jax.tree.map(lambda new, old: jnp.where(stopped, old, new), after, before)
+            kept = Trajectory(before.x[None], before.v[None], before.F_visual[None])
+            path = jax.tree.map(lambda new, old: jnp.where(stopped, old, new), path, kept)
+        return (after, stopped), (path, health)
+
+    carry = (particles, jnp.zeros((), bool))
+    (end, _), (paths, healths) = lax.scan(frame, carry, jnp.arange(frames))
+    joined = jax.tree.map(lambda rows: rows[:, 0], paths)
+    each = [jax.tree.map(lambda value, k=k: value[k], healths) for k in range(frames)]
+    return end, joined, _worst(each)
+
+
+def box_for(
+    paths: Iterable[tuple[Particles, Trajectory]], domain: Grid, duration: float, gravity: Any
+) -> tuple[int, int, int] | None:
+    """Nodes a side of a `SimConfig.box` for simulations like those that were seen, None where it would not pay. Host.
+
+    Args:
+        paths: particles at the start and their path.
+        domain: the grid.
+        duration: of a frame [s].
+        gravity: [m/s²].
+    """
+    most = np.zeros(3)
+    for particles, path in paths:
+        x = np.concatenate([np.asarray(particles.x)[None], np.asarray(path.x)])
+        v = np.concatenate([np.asarray(particles.v)[None], np.asarray(path.v)])
+        for here, velocity in zip(x[:-1], v[:-1]):
+            both = np.concatenate([here, _after(here, velocity, duration, np.asarray(gravity))])
+            both = both[np.isfinite(both).all(-1)]
+            if len(both):
+                most = np.maximum(most, np.ptp(both, axis=0))
+    needed = np.ceil(most / float(domain.dx)) + 2 * _AROUND + 2
+    room = np.ceil(needed * _ROOM_OF_ONE)
+    nx, ny, nz = map(int, np.minimum(room, domain.shape))
+    return (nx, ny, nz) if 2 * _nodes((nx, ny, nz)) <= _nodes(domain.shape) else None
+
+
+def _box_around(particles, domain, shape, duration, gravity):
+    """A box of a given size whose middle is that of where the particles are and are heading."""
+    x, v = lax.stop_gradient((particles.x, particles.v))
+    both = jnp.concatenate([x, _after(x, v, duration, lax.stop_gradient(gravity))])
+    sound = jnp.isfinite(both)
+    low = jnp.where(sound, both, jnp.inf).min(0)
+    high = jnp.where(sound, both, -jnp.inf).max(0)
+    middle = (jnp.where(low <= high, (low + high) / 2, 0.0) - domain.origin) / domain.dx
+    sides = np.array(domain.shape)
+    first = jnp.clip(jnp.round(middle - (np.array(shape) - 1) / 2), 0, sides - shape)
+    first = lax.stop_gradient(first)
+    grid = Grid(domain.origin + domain.dx * first, domain.dx, shape)
+    return Box(grid, first.astype(jnp.int32), jnp.asarray(sides, jnp.int32))
 
 
 def whole(domain: Grid) -> Box:
@@ -149,14 +236,18 @@ def _nodes(shape):
 def _ways(particles, duration, gravity):
     """Where particles are, and where they would be after a while of free flight."""
     x, v = (np.asarray(a, np.float64) for a in (particles.x, particles.v))
-    duration = float(duration)
-    return np.concatenate([x, x + v * duration + 0.5 * np.asarray(gravity) * duration**2])
+    return np.concatenate([x, _after(x, v, float(duration), np.asarray(gravity))])
+
+
+def _after(x, v, duration, gravity):
+    """Positions after a while of free flight."""
+    return x + v * duration + 0.5 * gravity * duration**2
 
 
 def _worst(healths):
     worst = healths[0]
     for health in healths[1:]:
         worst = worst.worse(health)
-    bad = [k for k, health in enumerate(healths) if health.first_bad_frame >= 0]
-    first = jnp.asarray(bad[0] if bad else -1)
+    bad = jnp.stack([health.first_bad_frame >= 0 for health in healths])
+    first = jnp.where(bad.any(), jnp.argmax(bad), -1)
     return Health(**(vars(worst) | {"first_bad_frame": first}))

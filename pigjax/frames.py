@@ -61,8 +61,12 @@ def run_frames(
     start: Float[Array, ""],
     frames: int,
     substeps: int,
+    of: int | None = None,
 ) -> tuple[Particles, Trajectory, Health, Bool[Array, "3 2"]]:
-    """Simulate from a time `start` [s] after the colliders were where they say; also tells the sides that were met."""
+    """Simulate from a time `start` [s] after the colliders were where they say; also tells the sides that were met.
+
+    Reverse mode keeps states for a simulation of frames `of` which these are a part.
+    """
     kernel, dtype = KERNELS[config.kernel], particles.x.dtype
     grid = box.grid
     grouping = group_by_law(particles, table, grid, devices, apart=contact is not None)
@@ -101,7 +105,7 @@ def run_frames(
         fillers=sum(-len(part) % devices for part, moves in zip(grouping.parts, grouping.moves) if moves),
     )
     nothing = Watch(perfect_health(dtype), jnp.zeros((3, 2), bool))
-    run = partial(_frames, setting, config, frames, substeps)
+    run = partial(_frames, setting, config, frames, substeps, _block_length(substeps, of or frames))
     if devices > 1:
         whole, shared = PartitionSpec(), PartitionSpec(_AXIS)
         mesh = Mesh(np.array(jax.local_devices()[:devices]), (_AXIS,))
@@ -119,9 +123,8 @@ def run_frames(
     return grouping.particles(states, grid), grouping.path(paths, grid, frames), health, met
 
 
-def _frames(setting, config, frames, substeps, scene, states, start, nothing):
+def _frames(setting, config, frames, substeps, block, scene, states, start, nothing):
     """Frames of substeps on this device's share of the particles."""
-    block = _block_length(substeps, frames)
     counts = [len(state.cells) for state in states]
 
     def substep(carry, _):

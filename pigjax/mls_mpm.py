@@ -16,11 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pigjax.boxes import devices_for, run_in_boxes, whole
+from pigjax.boxes import run_in_boxes, run_in_one_box
 from pigjax.colliders import Collider
 from pigjax.contact import BodyContact
 from pigjax.errors import InputError
-from pigjax.frames import run_frames
 from pigjax.materials import MaterialTable
 from pigjax.matter import Grid, Health, Particles, SimConfig, StepHealth, Trajectory
 from pigjax.sleep import Sleep, Sleeper
@@ -115,7 +114,7 @@ def step(
     _check_contact(particles, config, contact)
     if not _is_traced(particles, grid, table, dt, gravity, colliders, contact):
         _check_dt(float(dt), particles, grid, table, config, colliders)
-    end, _, health = _on_whole_grid(particles, grid, table, config, dt, (gravity, colliders, contact), 1, 1)
+    end, _, health = _in_one_box(particles, grid, table, config, dt, (gravity, colliders, contact), 1, 1)
     return end, health
 
 
@@ -135,9 +134,10 @@ def rollout(
     """Simulate `frames` frames of frame_dt [s] each under gravity [m/s²].
 
     Called with known numbers it visits only the part of the grid that matter is in. Inside jit, grad and vmap the whole
-    grid is held: give one that `fit_grid` has fitted. Reverse mode holds one state of the particles per block of about
-    √(frames · substeps) steps and recomputes within. With `sleep`, bodies at rest are left out until something comes
-    near them (outside of jit, grad and vmap only, since it is decided between frames).
+    grid is held, or a box of `config.box` nodes of it that moves with matter: give one that `fit_grid` has fitted.
+    Reverse mode holds one state of the particles per block of about √(frames · substeps) steps and recomputes within.
+    With `sleep`, bodies at rest are left out until something comes near them (outside of jit, grad and vmap only, since
+    it is decided between frames).
 
     Raises:
         InputError: config.substeps is None or `sleep` is given inside jit, grad or vmap, or the step is above
@@ -165,7 +165,7 @@ def rollout(
                 " choose_integrator finds from concrete values."
             )
         dt = jnp.asarray(frame_dt) / substeps
-        return _on_whole_grid(particles, grid, table, config, dt, (gravity, colliders, contact), frames, substeps)
+        return _in_one_box(particles, grid, table, config, dt, (gravity, colliders, contact), frames, substeps)
     config = choose_integrator(particles, grid, table, config, **steps)
     if substeps is None:
         substeps = choose_substeps(particles, grid, table, config, **steps)
@@ -188,24 +188,22 @@ def rollout(
     )
 
 
-def _on_whole_grid(particles, grid, table, config, dt, around, frames, substeps):
+def _in_one_box(particles, grid, table, config, dt, around, frames, substeps):
     gravity, colliders, contact = around
     dt, gravity, colliders, contact = _like((dt, jnp.asarray(gravity), colliders, contact), particles)
     grid, table = _like((grid, table), particles)
-    return run_frames(
+    return run_in_one_box(
         particles,
-        whole(grid),
+        grid,
         table,
         config,
-        devices_for(config, len(particles)),
         dt=dt,
         gravity=gravity,
         colliders=colliders,
         contact=contact,
-        start=jnp.zeros_like(dt),
         frames=frames,
         substeps=substeps,
-    )[:3]
+    )
 
 
 def _like(tree, particles):

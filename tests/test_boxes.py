@@ -106,16 +106,76 @@ def test_every_mode_and_number_of_devices_gives_the_same_derivatives(x64):
     np.testing.assert_allclose(slope, one[0], rtol=1e-6)
 
 
-def test_a_stopped_rollout_gives_back_its_last_good_frame():
+def thrown(cube, speed, box, *, frames=5):
+    """The squeezed cube thrown along x onto the floor, met by a moving wall."""
+    particles, grid = cube
+    bat = Plane(point=jnp.asarray([2.1, 0, 0]), normal=jnp.asarray([-1.0, 0, 0]), velocity=jnp.asarray([-1.0, 0, 0]))
+    v = jnp.broadcast_to(jnp.stack([speed, 0.3, -3.0]), particles.v.shape)
+    particles = eqx.tree_at(lambda p: p.v, particles, v)
+    config = SimConfig(substeps=20, devices=1, box=box)
+    return rollout(
+        particles, grid, ELASTIC, config, frames=frames, frame_dt=0.02, gravity=(0.0, 0.0, -9.8),
+        colliders=(FLOOR, bat),
+    )  # fmt: skip
+
+
+def test_a_box_that_moves_within_jit_gives_what_the_whole_grid_gives(x64):
+    """Values, health and gradients of a batch whose rows fly apart."""
+    cube, h = squeezed_cube(), 1e-5
+
+    def place(speed, box):
+        end, path, health = thrown(cube, speed, box)
+        return (end.x[:, 0] ** 3).sum() + (end.x[:, 2] ** 2).sum(), (end, path, health)
+
+    assert all(np.array(cube[1].shape) > [14, 12, 14])
+    speeds = jnp.asarray([-4.0, 4.0])
+    whole = jax.jit(jax.vmap(partial(place, box=None)))
+    slope, boxed = jax.jit(jax.vmap(jax.grad(partial(place, box=(14, 12, 14)), has_aux=True)))(speeds)
+    value, (end, path, health) = whole(jnp.concatenate([speeds, speeds - h, speeds + h]))
+    assert float(jnp.abs(end.x - cube[0].x).max((1, 2)).min()) > 2 * DX
+    assert (health.first_bad_frame < 0).all()
+    for a, b in zip(jax.tree.leaves((end, path, health)), jax.tree.leaves(boxed), strict=True):
+        np.testing.assert_allclose(b, a[:2], atol=1e-8 * max(1.0, float(np.abs(a).max())))
+    np.testing.assert_allclose(slope, (value[4:] - value[2:4]) / (2 * h), rtol=1e-5)
+    assert float(jnp.abs(slope).min()) > 0.1
+
+
+def test_what_outruns_its_box_is_counted(x64):
+    cube = squeezed_cube()
+    _, _, health = jax.jit(lambda speed: thrown(cube, speed, (8, 8, 8), frames=1))(20.0)
+    assert int(health.escaped) > 0
+    assert int(health.first_bad_frame) == 0
+
+
+def test_a_box_is_as_large_as_a_motion_needs_and_none_where_it_would_not_pay(x64):
+    cube = particles, _ = squeezed_cube()
+    _, path, _ = thrown(cube, jnp.asarray(4.0), None)
+    side = np.ptp(np.asarray(particles.x), axis=0) / DX
+    still = make_particles(particles.x, volume=(DX / 2) ** 3, table=ELASTIC)
+    at_rest = (still, eqx.tree_at(lambda p: (p.x, p.v), path, (path.x * 0 + still.x, path.v * 0)))
+    vast = Grid(jnp.zeros(3), jnp.asarray(DX), (64, 64, 64))
+    of_rest = boxes.box_for([at_rest], vast, 0.02, (0.0, 0.0, 0.0))
+    assert of_rest == tuple(np.ceil(1.15 * (np.ceil(side) + 6)).astype(int))
+    of_both = boxes.box_for([at_rest, (particles, path)], vast, 0.02, (0.0, 0.0, -9.8))
+    assert of_both[0] >= of_rest[0] + 1.15 * (0.02 * 4.0 / DX - 1)
+    _, _, health = jax.jit(lambda speed: thrown(cube, speed, of_both))(4.0)
+    assert int(health.escaped) == 0
+    assert boxes.box_for([(particles, path)], fit_grid(particles.x, DX), 0.02, (0.0, 0.0, -9.8)) is None
+
+
+@pytest.mark.parametrize("traced", [False, True])
+def test_a_stopped_rollout_gives_back_its_last_good_frame(traced):
     """An unstable step is forced, which takes a few frames to break down."""
     particles = jax.tree.map(lambda a: a.astype(jnp.float32) if a.dtype == float else a, two_cubes())
     particles = eqx.tree_at(lambda p: p.F, particles, 0.99 * particles.F)
     small = Grid(jnp.zeros(3, jnp.float32), jnp.asarray(DX, jnp.float32), (36, 36, 36))
-    config = SimConfig(substeps=1, stop=True, force=True)
+    config = SimConfig(substeps=1, stop=True, force=True, box=(20, 16, 16))
     limit = float(stable_dt(TABLE, small, max_speed=1.0, cfl=1.0))
-    end, path, health = rollout(
-        particles, small, TABLE, config, frames=30, frame_dt=4.0 * limit, gravity=(0.0, 0.0, -9.8), colliders=(FLOOR,)
-    )
+    run = partial(
+        rollout, grid=small, table=TABLE, config=config, frames=30, frame_dt=4.0 * limit, gravity=(0.0, 0.0, -9.8),
+        colliders=(FLOOR,),
+    )  # fmt: skip
+    end, path, health = (jax.jit(run) if traced else run)(particles)
     bad = int(health.first_bad_frame)
     print("bad in frame", bad, health.problems())
     assert 0 < bad < 30

@@ -22,6 +22,7 @@ from pigjax.scene import load_scene, run_scene, scene_from
 from pigjax.segmentation import lift_masks
 from pigjax.splat import RenderConfig, render
 from pigjax.study import Voting, experiment, load_study, sweep_study, tune_study
+from pigjax.study.objectives import pyramid_error, video
 from pigjax.tune import load_table
 
 STUDIES = Path(__file__).parents[1] / "examples" / "studies"
@@ -222,6 +223,28 @@ def test_a_video_is_its_own_best_match(folder, outcome, tmp_path):
     table = sweep_study(load_study(path), tmp_path)
     assert table.best("loss")["objects.ball.young"] == 4000.0
     assert table["loss"][1] < 1e-10 < 1e-7 < np.delete(table["loss"], 1).min()
+
+
+def test_smaller_pictures_tell_how_far_apart_things_lie(outcome):
+    def square(column):
+        return np.pad(np.ones((1, 2, 2, 3)), ((0, 0), (4, 10), (column, 14 - column), (0, 0)))
+
+    def halved(picture):
+        rows = (picture[:, ::2] + picture[:, 1::2]) / 2
+        return (rows[:, :, ::2] + rows[:, :, 1::2]) / 2
+
+    def error(column, levels):
+        return float(pyramid_error(jnp.asarray(square(column)), jnp.asarray(square(2)), levels))
+
+    assert error(6, 1) == error(12, 1)  # of no help
+    assert error(3, 4) < error(6, 4) < error(12, 4)
+    wanted, difference = 0.0, square(6) - square(2)
+    for _ in range(4):
+        wanted, difference = wanted + (difference**2).mean(), halved(difference)
+    assert error(6, 4) == pytest.approx(wanted, rel=1e-6)
+    frames = outcome.experiment.video(outcome.trajectory)
+    with pytest.raises(SceneError, match=r"levels = 99: pictures of this size have 1 to"):
+        video(outcome, target=frames, levels=99)
 
 
 def test_own_objectives_are_read_from_files(folder, tmp_path):

@@ -7,6 +7,7 @@ import jax
 
 from pigjax.arrays import static_field
 from pigjax.errors import InputError
+from pigjax.matter.state import WALL
 from pigjax.transfers import KERNELS
 
 _WALLS = ("separate", "slip", "sticky")
@@ -32,6 +33,7 @@ class SimConfig(eqx.Module):
     newton_steps: int = static_field(default=12)  # of an implicit step, at most
     newton_tolerance: float = static_field(default=1e-3)  # momentum out of balance, relative to what drives the step
     krylov_steps: int = static_field(default=300)  # of a Newton step, at most
+    box: tuple[int, int, int] | None = static_field(default=None)  # nodes that move with matter in jit, grad and vmap
     devices: int | None = static_field(default=None)  # that share the particles; None: all local ones, if it pays
     differentiation: str = static_field(default="reverse")  # or "forward": for jvp, jacfwd and hessian
     chunk: int | None = static_field(default=None)  # particles handled at once; None: 512 on a CPU, else all
@@ -47,6 +49,8 @@ class SimConfig(eqx.Module):
                 raise InputError(f"SimConfig.{name} = {value!r}: choose one of {', '.join(choices)}.")
         if self.substeps is not None and self.substeps < 1:
             raise InputError(f"SimConfig.substeps = {self.substeps}: must be 1 or more.")
+        if self.box is not None and min(self.box) < 2 * WALL + 2:
+            raise InputError(f"SimConfig.box = {self.box}: every side needs {2 * WALL + 2} nodes or more.")
         if self.chunk is not None and self.chunk < 1:
             raise InputError(f"SimConfig.chunk = {self.chunk}: must be 1 or more.")
         if not 0 < self.visual_stretch[0] <= self.visual_stretch[1]:

@@ -21,6 +21,7 @@ from jax import lax
 from jaxtyping import Array, Float
 from scipy.cluster.vq import kmeans2
 
+from pigjax.boxes import box_for
 from pigjax.camera import Camera
 from pigjax.clamp import ClampParams
 from pigjax.colliders import Collider
@@ -342,8 +343,11 @@ def _fitted(made: Experiment, dx: float, extremes: list[Mapping[str, Any]], marg
     config = choose_integrator(made.particles, near, made.table, made.config, **steps(made))
     substeps = max(choose_substeps(case.particles, near, case.table, config, **steps(case)) for case in cases)
     config = replace(config, substeps=substeps)
-    reached = [np.asarray(made.particles.x)]
+    reached, paths = [np.asarray(made.particles.x)], []
     for case in cases:
-        outcome = replace(case, config=config).simulate()
-        reached.append(np.asarray(outcome.trajectory.x).reshape(-1, 3))
-    return replace(made, config=config, grid=fit_grid(np.concatenate(reached), dx, margin=margin))
+        trajectory = replace(case, config=config).simulate().trajectory
+        reached.append(np.asarray(trajectory.x).reshape(-1, 3))
+        paths.append((case.particles, trajectory))
+    grid = fit_grid(np.concatenate(reached), dx, margin=margin)
+    box = box_for(paths, grid, float(made.frame_dt), made.gravity)
+    return replace(made, config=replace(config, box=box), grid=grid)

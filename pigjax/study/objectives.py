@@ -80,8 +80,11 @@ def shape(outcome: Outcome, *, aspect: float = 10.0, stretch: float = 3.0) -> Sc
     }
 
 
-def video(outcome: Outcome, *, target: Float[Array, "t h w 3"]) -> Scores:
-    """Mean squared difference from a video of the same frames, and PSNR [dB]; a first picture at rest is left out."""
+def video(outcome: Outcome, *, target: Float[Array, "t h w 3"], levels: int = 1) -> Scores:
+    """Mean squared difference from a video of the same frames, and PSNR [dB]; a first picture at rest is left out.
+
+    With more `levels` the loss also counts the pictures at a half, a quarter, ... of their size (`pyramid_error`).
+    """
     seen = outcome.experiment.video(outcome.trajectory)
     target = target[1:] if len(target) == len(seen) + 1 else target
     if seen.shape != target.shape:
@@ -89,7 +92,22 @@ def video(outcome: Outcome, *, target: Float[Array, "t h w 3"]) -> Scores:
             f"objective.options.target holds frames of shape {target.shape}, the scene draws {seen.shape}: give it"
             " simulation.frames pictures (or one more, at rest) of the camera's width and height."
         )
-    return {"loss": jnp.mean((seen - target) ** 2), "psnr": jnp.mean(jax.vmap(psnr)(seen, target))}
+    if not 1 <= levels <= (most := int(np.log2(min(seen.shape[1:3]))) + 1):
+        raise SceneError(f"objective.options.levels = {levels}: pictures of this size have 1 to {most} levels.")
+    return {"loss": pyramid_error(seen, target, levels), "psnr": jnp.mean(jax.vmap(psnr)(seen, target))}
+
+
+def pyramid_error(seen: Float[Array, "t h w 3"], target: Float[Array, "t h w 3"], levels: int) -> Float[Array, ""]:
+    """Sum of the mean squared differences of two videos at full size, half of it, and so on, `levels` sizes in all.
+
+    What is drawn beside where it should be, without touching it, has a slope in the small pictures only.
+    """
+    difference, total = seen - target, jnp.zeros((), seen.dtype)
+    for _ in range(levels):
+        total += jnp.mean(difference**2)
+        h, w = (side // 2 * 2 for side in difference.shape[1:3])
+        difference = difference[:, :h, :w].reshape(len(seen), h // 2, 2, w // 2, 2, 3).mean((2, 4))
+    return total
 
 
 OBJECTIVES: dict[str, Callable[..., Scores]] = {"motion": motion, "aim": aim, "shape": shape, "video": video}
