@@ -28,7 +28,8 @@ EDGE = -0.39  # of the table [m]
 OFF = EDGE - 0.02  # a middle of the cube that is off [m]
 WANTED = -0.5  # what the objective asks of it [m]
 WEAK = [0.1, -1.2, 0.3]  # reaches the cube and leaves it on the table
-WIDE = [-0.8, -1.6, 0.2]  # passes it
+WIDE = [-0.8, -0.8, 0.2]  # passes it
+HARD = [0.2, -2.5, 0.5]  # knocks it far off
 STEPS, EVALUATIONS = 40, 112
 HEADER = "| throw | velocity [m/s] | cube at the end: y [m] | z [m] | off |\n|---|---|---|---|---|"
 
@@ -38,7 +39,8 @@ def prepared():
     """Experiment, and bounds of the throw."""
     study = load_study(STUDIES / "knock_off.toml")
     throw = study.parameters[THROW]
-    made = experiment(study.to_scene(), alone=True, extremes=[{THROW: throw.low}, {THROW: throw.high}])
+    extremes = [{THROW: velocity} for velocity in (throw.low, throw.high, WEAK, WIDE, HARD)]
+    made = experiment(study.to_scene(), alone=True, extremes=extremes)
     return made, {THROW: Bounds(throw.low, throw.high)}
 
 

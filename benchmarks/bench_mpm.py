@@ -1,8 +1,8 @@
 """Speed, error and memory of MLS-MPM: `python benchmarks/bench_mpm.py [part ...] [--rivals PYTHON]`.
 
-Parts: speed (ours on one and all devices, rivals beside), laws, gradient, domain, features, sleep, batch, memory. Times
-are medians of warm windows, compile time apart. `--rivals` is the Python of an environment with Taichi 1.7.4 and Warp
-1.19, `--peers` the folder of their scripts. Without parts, all are run.
+Parts: speed (ours on one and all devices, rivals beside), stages, laws, gradient, domain, features, sleep, batch,
+memory. Times are medians of warm windows, compile time apart. `--rivals` is the Python of an environment with Taichi
+1.7.4 and Warp 1.19, `--peers` the folder of their scripts. Without parts, all are run.
 """
 
 import argparse
@@ -12,12 +12,14 @@ import resource
 import statistics
 import subprocess
 import time
+from functools import partial
 from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _profile import seconds_by_scope
 from _timing import machine, use_host_devices
 
 from pigjax.boxes import Fit, whole
@@ -133,6 +135,37 @@ def laws(arguments):
             error = np.abs(np.asarray(end.x, np.float64) - np.asarray(exact.x)).max() / way
         each, rate = seconds / count * 1e9, count / seconds / 1e6
         print(f"| {law} | {each:.0f} | {rate:.2f} | {compile_seconds:.1f} | {error:.1e} |", flush=True)
+
+
+STAGES = {
+    "to_grid": "to the grid: windows are made",
+    "add_windows": "to the grid: windows are added",
+    "on_grid": "on the grid: velocities, boundaries",
+    "take_windows": "to the particles: windows are read",
+    "from_grid": "to the particles: sums over windows",
+    "law": "the law, and particles move",
+    "health": "health, and what is not finite",
+}
+
+
+def stages(arguments):
+    """Where the time of a substep goes, one device: shares by the profiler, of the time without it."""
+    print(f"| ns per particle and substep | {' | '.join(STAGES.values())} | frame: sort, chunks | all |")
+    print("|---" * (len(STAGES) + 3) + "|")
+    steps = 20
+    for law in arguments.laws:
+        for count, nodes in CASES:
+            particles, _, table = scene(law, count, nodes)
+            box = whole(fit_grid(particles.x, 1 / nodes, margin=2 / nodes))
+            settings, step = SimConfig(devices=1), {"frames": 1, "substeps": steps, "start": jnp.float32(0)}
+            step |= {"dt": jnp.float32(DT), "gravity": jnp.asarray(DOWN), "colliders": (), "contact": None}
+            compiled = run_frames.lower(particles, box, table, settings, 1, **step).compile().compiled
+            run = partial(run_frames, particles, box, table, settings, 1, **step)
+            _, seconds, _ = timed(run)
+            own = seconds_by_scope(compiled, run, STAGES)
+            scale = seconds / sum(own.values()) / count / steps * 1e9
+            cells = " | ".join(f"{scale * own[stage]:.0f}" for stage in (*STAGES, "rest"))
+            print(f"| {law} {count // 1000}k/{nodes}³ | {cells} | {seconds / count / steps * 1e9:.0f} |", flush=True)
 
 
 def gradient(arguments):
@@ -262,13 +295,15 @@ def memory(arguments):
         print(f"| {count // 1000}k/{nodes}³ | {total[0]:.0f} | {total[1]:.0f} | {peak} |", flush=True)
 
 
-PARTS = {part.__name__: part for part in (speed, laws, gradient, domain, features, sleep, batch, memory)}
+PARTS = {part.__name__: part for part in (speed, stages, laws, gradient, domain, features, sleep, batch, memory)}
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("parts", nargs="*", metavar="part", help=", ".join(PARTS))
-    parser.add_argument("--laws", nargs="+", default=["fixed_corotated", "neo_hookean"], help="of part speed")
+    parser.add_argument(
+        "--laws", nargs="+", default=["fixed_corotated", "neo_hookean"], help="of parts speed and stages"
+    )
     parser.add_argument("--rivals", help="Python with Taichi and Warp")
     parser.add_argument("--peers", default="../shared/peers", help="folder of the rivals' scripts")
     arguments = parser.parse_args()

@@ -19,15 +19,15 @@ from jaxtyping import Float
 
 from pigjax.errors import SimulationError
 from pigjax.frames import Box, run_frames
-from pigjax.materials import MaterialTable
-from pigjax.matter import Grid, Health, Particles, SimConfig, Trajectory
+from pigjax.materials import LAWS, MaterialTable
+from pigjax.matter import WALL, Grid, Health, Particles, SimConfig, Trajectory, perfect_health
 
 _SMALL = 50_000  # nodes that need no box: less than other costs of a step
 _LARGEST = 200_000_000  # nodes
 _ROOM = 1.3  # a box is made so much longer than it must be: another size is another compilation
 _ROOM_OF_ONE = 1.15  # the same of a box of fixed size, for what is faster than what was seen
 _UNIT = 4  # nodes, of which sides are multiples
-_AROUND = 2  # cells of a box of fixed size around where matter is seen and is heading
+_AROUND = 6  # nodes a side of a box of fixed size more than matter was seen to need: the kernel's, and some room
 _PER_DEVICE = 4096  # particles that are worth a device of their own
 
 
@@ -76,7 +76,7 @@ def run_in_one_box(
     frames: int,
     **step,
 ) -> tuple[Particles, Trajectory, Health]:
-    """The same inside jit, grad and vmap: a box of `config.box` nodes, or the whole domain, moves with the particles.
+    """The same inside jit, grad and vmap: a box of `config.box` nodes, or the whole domain, moves with matter.
 
     What is faster than a box allows is held back at its edge and counted as escaped.
     """
@@ -88,8 +88,8 @@ def run_in_one_box(
     duration = step["dt"] * step["substeps"]
 
     def frame(carry, number):
-        before, stopped = carry
-        box = _box_around(before, domain, shape, duration, step["gravity"])
+        before, worst, stopped = carry
+        box = _box_around(before, table, domain, shape, duration, step["gravity"])
         after, path, health, _ = run_frames(
             before, box, table, config, devices, start=duration * number, frames=1, of=frames, **step
         )
@@ -99,54 +99,56 @@ def run_in_one_box(
             after = jax.tree.map(lambda new, old: jnp.where(stopped, old, new), after, before)
             kept = Trajectory(before.x[None], before.v[None], before.F_visual[None])
             path = jax.tree.map(lambda new, old: jnp.where(stopped, old, new), path, kept)
-        return (after, stopped), (path, health)
+        return (after, worst.worse(health.of_step()), stopped), (jax.tree.map(lambda rows: rows[0], path), bad)
 
-    carry = (particles, jnp.zeros((), bool))
-    (end, _), (paths, healths) = lax.scan(frame, carry, jnp.arange(frames))
-    joined = jax.tree.map(lambda rows: rows[:, 0], paths)
-    each = [jax.tree.map(lambda value, k=k: value[k], healths) for k in range(frames)]
-    return end, joined, _worst(each)
+    carry = (particles, perfect_health(particles.x.dtype), jnp.zeros((), bool))
+    (end, worst, _), (path, bad) = lax.scan(frame, carry, jnp.arange(frames))
+    return end, path, Health(**vars(worst), substeps=jnp.asarray(step["substeps"]), first_bad_frame=_first(bad))
 
 
 def box_for(
-    paths: Iterable[tuple[Particles, Trajectory]], domain: Grid, duration: float, gravity: Any
+    runs: Iterable[tuple[Particles, Trajectory, float, Any]], table: MaterialTable, domain: Grid
 ) -> tuple[int, int, int] | None:
     """Nodes a side of a `SimConfig.box` for simulations like those that were seen, None where it would not pay. Host.
 
     Args:
-        paths: particles at the start and their path.
+        runs: particles at the start, their path, the duration of a frame [s] and gravity [m/s²].
+        table: materials, of which those that move count.
         domain: the grid.
-        duration: of a frame [s].
-        gravity: [m/s²].
     """
-    most = np.zeros(3)
-    for particles, path in paths:
-        x = np.concatenate([np.asarray(particles.x)[None], np.asarray(path.x)])
-        v = np.concatenate([np.asarray(particles.v)[None], np.asarray(path.v)])
-        for here, velocity in zip(x[:-1], v[:-1]):
+    half = np.zeros(3)
+    for particles, path, duration, gravity in runs:
+        moving = _moving(particles, table)
+        x = np.concatenate([np.asarray(particles.x)[None], np.asarray(path.x)])[:, moving]
+        v = np.concatenate([np.asarray(particles.v)[None], np.asarray(path.v)])[:, moving]
+        for here, velocity, there in zip(x[:-1], v[:-1], x[1:]):
             both = np.concatenate([here, _after(here, velocity, duration, np.asarray(gravity))])
-            both = both[np.isfinite(both).all(-1)]
+            both, there = (points[np.isfinite(points).all(-1)] for points in (both, there))
             if len(both):
-                most = np.maximum(most, np.ptp(both, axis=0))
-    needed = np.ceil(most / float(domain.dx)) + 2 * _AROUND + 2
-    room = np.ceil(needed * _ROOM_OF_ONE)
-    nx, ny, nz = map(int, np.minimum(room, domain.shape))
+                middle = (both.min(0) + both.max(0)) / 2
+                half = np.maximum(half, np.abs(np.concatenate([both, there]) - middle).max(0))
+    needed = np.ceil(2 * half / float(domain.dx)) + _AROUND
+    nx, ny, nz = map(int, np.clip(np.ceil(needed * _ROOM_OF_ONE), 2 * WALL + 2, domain.shape))
     return (nx, ny, nz) if 2 * _nodes((nx, ny, nz)) <= _nodes(domain.shape) else None
 
 
-def _box_around(particles, domain, shape, duration, gravity):
-    """A box of a given size whose middle is that of where the particles are and are heading."""
-    x, v = lax.stop_gradient((particles.x, particles.v))
-    both = jnp.concatenate([x, _after(x, v, duration, lax.stop_gradient(gravity))])
-    sound = jnp.isfinite(both)
-    low = jnp.where(sound, both, jnp.inf).min(0)
-    high = jnp.where(sound, both, -jnp.inf).max(0)
-    middle = (jnp.where(low <= high, (low + high) / 2, 0.0) - domain.origin) / domain.dx
+def _box_around(particles, table, domain, shape, duration, gravity):
+    """A box of a given size whose middle is that of where moving matter is and is heading."""
+    both = jnp.concatenate([particles.x, _after(particles.x, particles.v, duration, gravity)])
+    counts = jnp.isfinite(both) & jnp.tile(_moving(particles, table), 2)[:, None]
+    low = jnp.where(counts, both, jnp.inf).min(0)
+    high = jnp.where(counts, both, -jnp.inf).max(0)
+    middle = (jnp.where(low <= high, (low + high) / 2, domain.origin) - domain.origin) / domain.dx
     sides = np.array(domain.shape)
-    first = jnp.clip(jnp.round(middle - (np.array(shape) - 1) / 2), 0, sides - shape)
-    first = lax.stop_gradient(first)
+    first = lax.stop_gradient(jnp.clip(jnp.round(middle - (np.array(shape) - 1) / 2), 0, sides - shape))
     grid = Grid(domain.origin + domain.dx * first, domain.dx, shape)
     return Box(grid, first.astype(jnp.int32), jnp.asarray(sides, jnp.int32))
+
+
+def _moving(particles, table):
+    """Which particles are of a law that moves; in the form (numpy or JAX) of their materials."""
+    still = [row for row, law in enumerate(table.laws) if LAWS[law].respond is None]
+    return sum(particles.material == row for row in still) == 0 if still else particles.material >= 0
 
 
 def whole(domain: Grid) -> Box:
@@ -249,5 +251,8 @@ def _worst(healths):
     for health in healths[1:]:
         worst = worst.worse(health)
     bad = jnp.stack([health.first_bad_frame >= 0 for health in healths])
-    first = jnp.where(bad.any(), jnp.argmax(bad), -1)
-    return Health(**(vars(worst) | {"first_bad_frame": first}))
+    return Health(**(vars(worst) | {"first_bad_frame": _first(bad)}))
+
+
+def _first(bad):
+    return jnp.where(bad.any(), jnp.argmax(bad), -1)

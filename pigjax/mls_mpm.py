@@ -1,7 +1,7 @@
 """MLS-MPM (Hu et al. 2018, doi 10.1145/3197517.3201293) with APIC: one explicit step, and whole rollouts.
 
 A rollout of known numbers goes frame by frame on the box of the grid that its particles need (`boxes`); inside jit,
-grad and vmap it is one program on the whole grid. `substep` holds the equations.
+grad and vmap it is one program on the whole grid, or on a box of fixed size that moves. `substep` holds the equations.
 """
 
 from __future__ import annotations
@@ -135,7 +135,8 @@ def rollout(
 
     Called with known numbers it visits only the part of the grid that matter is in. Inside jit, grad and vmap the whole
     grid is held, or a box of `config.box` nodes of it that moves with matter: give one that `fit_grid` has fitted.
-    Reverse mode holds one state of the particles per block of about √(frames · substeps) steps and recomputes within.
+    Reverse mode holds one state of the particles per block of about √(frames · substeps) steps and recomputes within;
+    with a box it also keeps what each frame was set up with.
     With `sleep`, bodies at rest are left out until something comes near them (outside of jit, grad and vmap only, since
     it is decided between frames).
 

@@ -35,15 +35,15 @@ def scatter_chunks(
 
 
 def gather_chunks(
-    own: Pass, go: Bool[Array, ""], grid: Float[Array, "x y z 3"], chunks: Any, shared: Any, health: Any, *, ruled: bool
+    own: Pass, go: Bool[Array, ""], grid: Float[Array, "x y z 3"], chunks: Any, shared: Any, tally: Any, *, ruled: bool
 ) -> tuple[Any, Any]:
-    """Chunks after `own.function(go, windows, chunk, shared)` with windows [n n n 3 c], and the worst health of them.
+    """Chunks after `own.function(go, windows, chunk, shared)` with windows [n n n 3 c], and the tally of them all.
 
     The function returns the chunk's new arrays in the form of the old ones, whose first are the cells [n 3 c], and its
-    health, which has no derivative.
+    tally, which has no derivative.
     """
     run = _ruled_gather if ruled else _gather
-    return run(own, go, grid, chunks, shared, health)
+    return run(own, go, grid, chunks, shared, tally)
 
 
 def _scatter(own, go, chunks, shared):
@@ -81,24 +81,24 @@ def _scatter_backward(own, residuals, cotangent):
 _ruled_scatter.defvjp(_scatter_forward, _scatter_backward)
 
 
-def _gather(own, go, grid, chunks, shared, health):
+def _gather(own, go, grid, chunks, shared, tally):
     def visit(i, carry):
-        chunks, health = carry
+        chunks, tally = carry
         chunk = _chunk(chunks, i)
         windows = take_windows(grid, _first(own, go, chunk[0]), own.kernel)
         new, more = own.function(go, windows, chunk, shared)
-        return _put(chunks, i, new), health.worse(more)
+        return _put(chunks, i, new), tally.joined(more)
 
-    return lax.fori_loop(0, len(chunks[0]), visit, (chunks, health))
+    return lax.fori_loop(0, len(chunks[0]), visit, (chunks, tally))
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _ruled_gather(own, go, grid, chunks, shared, health):
-    return _gather(own, go, grid, chunks, shared, health)
+def _ruled_gather(own, go, grid, chunks, shared, tally):
+    return _gather(own, go, grid, chunks, shared, tally)
 
 
-def _gather_forward(own, go, grid, chunks, shared, health):
-    return _gather(own, go, grid, chunks, shared, health), (go, grid, chunks, shared)
+def _gather_forward(own, go, grid, chunks, shared, tally):
+    return _gather(own, go, grid, chunks, shared, tally), (go, grid, chunks, shared)
 
 
 def _gather_backward(own, residuals, cotangents):

@@ -86,27 +86,78 @@ class Watch(eqx.Module):
         """The worse of two, number by number."""
         return Watch(self.health.worse(other.health), self.met | other.met)
 
+    def beside(self, other: Watch) -> Watch:
+        """Of two groups in the same step: the worse of both, and counts add up."""
+        counts = [watch.health.escaped for watch in (self, other)], [watch.health.inverted for watch in (self, other)]
+        return eqx.tree_at(lambda w: (w.health.escaped, w.health.inverted), self.worse(other), tuple(map(sum, counts)))
+
+
+class Tally(NamedTuple):
+    """Health of a step, lane by lane of the chunks: XLA:CPU runs each sum over a chunk as an operation of its own."""
+
+    min_J: Float[Array, "c"]
+    speed_squared: Float[Array, "c"]  # the largest
+    out: Bool[Array, "3 2 c"]  # past a side of the box
+    escaped: Int[Array, "c"]
+    inverted: Int[Array, "c"]
+
+    def joined(self, other: Tally) -> Tally:
+        """Of both chunks; counts add up."""
+        return Tally(
+            jnp.minimum(self.min_J, other.min_J),
+            jnp.maximum(self.speed_squared, other.speed_squared),
+            self.out | other.out,
+            self.escaped + other.escaped,
+            self.inverted + other.inverted,
+        )
+
+    def watch(self, cells_per_speed: Float[Array, ""]) -> Watch:
+        """What it says of the step; `cells_per_speed` [cells s/m] is the way of a step at 1 m/s."""
+        health = StepHealth(
+            min_J=self.min_J.min(),
+            max_courant=jnp.sqrt(self.speed_squared.max()) * cells_per_speed,
+            escaped=self.escaped.sum(),
+            nonfinite=jnp.zeros((), int),
+            inverted=self.inverted.sum(),
+            unconverged=jnp.zeros((), int),
+        )
+        return Watch(health, self.out.any(2))
+
+
+def _no_tally(like: Float[Array, "_ c"]) -> Tally:
+    lanes, zero = like.shape[-1], jnp.zeros_like(like[0])
+    count = jnp.zeros(lanes, int)
+    return Tally(zero + jnp.inf, zero, jnp.zeros((3, 2, lanes), bool), count, count)
+
 
 def advance(
     setting: Setting, scene: Scene, states: tuple[State, ...], time: Array, nothing: Watch
 ) -> tuple[tuple[State, ...], Watch]:
-    """One step of all groups."""
-    nodes = _to_grid(setting, scene, states)
-    if setting.balance is None:
-        _, velocity = free_velocity(scene, nodes)
-        if scene.contact is not None:
-            velocity = _part_bodies(setting, scene, states, nodes, velocity)
-        velocity, converged = boundaries(setting, scene, velocity, time=time), True
-    else:
-        velocity, converged = setting.balance(setting, scene, states, nodes, time)
+    """One step of all groups. Its stages bear names in a profile."""
+    with jax.named_scope("to_grid"):
+        nodes = _to_grid(setting, scene, states)
+    with jax.named_scope("on_grid"):
+        velocity, converged = _on_grid(setting, scene, states, nodes, time)
     watch, moved = eqx.tree_at(lambda w: w.health.unconverged, nothing, jnp.asarray(converged) ^ True), []
     for law, parameters, state in zip(setting.laws, scene.parameters, states):
         take = Pass(partial(_take, setting, scene.nodes, scene.bodies, law), setting.kernel, scene.nodes)
         shared = (scene.dt, scene.grid.dx, parameters)
-        state, own = gather_chunks(take, scene.go, velocity, state, shared, nothing, ruled=setting.ruled)
+        with jax.named_scope("from_grid"):
+            none = _no_tally(state.cells[0])
+            state, tally = gather_chunks(take, scene.go, velocity, state, shared, none, ruled=setting.ruled)
         moved.append(state)
-        watch = watch.worse(own)
+        watch = watch.beside(lax.stop_gradient(tally.watch(scene.dt / scene.grid.dx)))
     return tuple(moved), watch
+
+
+def _on_grid(setting, scene, states, nodes, time):
+    """Velocities of the nodes after the step, and whether they were found."""
+    if setting.balance is not None:
+        return setting.balance(setting, scene, states, nodes, time)
+    _, velocity = free_velocity(scene, nodes)
+    if scene.contact is not None:
+        velocity = _part_bodies(setting, scene, states, nodes, velocity)
+    return boundaries(setting, scene, velocity, time=time), True
 
 
 def _to_grid(setting, scene, states):
@@ -137,17 +188,25 @@ def _give(setting, shape, go, cells, chunk, shared):
 
 
 def _take(setting, shape, bodies, law, go, windows, state, shared):
-    """A chunk after the step, and its health."""
+    """A chunk after the step, and its tally."""
     dt, dx, parameters = shared
     transfer = ruled_from_windows if setting.ruled else from_windows
     distance = stage(go, lambda cells: distances(cells, setting.kernel, shape), state.cells)
     v, per_cell = transfer(setting.kernel, go, distance, windows)
-    new = stage(go, partial(_respond, law), state, v, per_cell, dt, dx, parameters)
-    return stage(go, partial(_check, shape, bodies), new, state.cells, state.volume, dt, dx)
+    with jax.named_scope("law"):
+        new = stage(go, partial(_respond, law), state, v, per_cell, dt, dx, parameters)
+    return _settle(shape, bodies, go, new, state)
 
 
-def _check(shape, bodies, state, before, volume, dt, dx):
-    """The state held inside the grid, what is not finite taken out, and its health."""
+def _settle(shape, bodies, go, new, state):
+    """A chunk held in the grid, without what is not finite, and its tally."""
+    with jax.named_scope("health"):
+        ok, held, tally = stage(go, partial(_check, shape, bodies), new, state.cells, state.volume)
+        return _only_finite(ok, new._replace(cells=held), shape), tally
+
+
+def _check(shape, bodies, state, before, volume):
+    """Which particles are finite, the cells that the grid holds them in, and the health."""
     low, high = np.ones((3, 1)), np.array(shape)[:, None] / np.array([[bodies], [1], [1]]) - 2.0
     low, high = low.astype(before.dtype), high.astype(before.dtype)
     if bodies > 1:
@@ -155,21 +214,18 @@ def _check(shape, bodies, state, before, volume, dt, dx):
         start = jnp.floor(before[:1] / width) * width * np.eye(3, 1, dtype=before.dtype)
         low, high = low + start, high + start
     held = jnp.clip(state.cells, low, high)
-    J, speed = determinant(by_component(state.F)), jnp.sqrt((state.v**2).sum(0))
-    alive = (volume[0] > 0) & ~jnp.isnan(J) & ~jnp.isnan(speed)  # what is not is counted as such
+    J, speed_squared = determinant(by_component(state.F)), (state.v**2).sum(0)
+    alive = (volume[0] > 0) & ~jnp.isnan(J) & ~jnp.isnan(speed_squared)  # what is not is counted as such
     out = jnp.stack([state.cells < held, state.cells > held], 1) & alive
-    watch = Watch(
-        health=StepHealth(
-            min_J=jnp.where(alive, J, jnp.inf).min(),
-            max_courant=jnp.where(alive, speed, 0.0).max() * dt / dx,
-            escaped=out.any((0, 1)).sum(),
-            nonfinite=jnp.zeros((), int),
-            inverted=(alive & (J <= 0)).sum(),
-            unconverged=jnp.zeros((), int),
-        ),
-        met=out.any(2),
+    tally = Tally(
+        min_J=jnp.where(alive, J, jnp.inf),
+        speed_squared=jnp.where(alive, speed_squared, 0.0),
+        out=out,
+        escaped=out.any((0, 1)).astype(int),
+        inverted=(alive & (J <= 0)).astype(int),
     )
-    return _only_finite(state._replace(cells=held), shape), jax.tree.map(lax.stop_gradient, watch)
+    ok = jnp.isfinite(sum(rows.sum(0) for rows in jax.tree.leaves(state._replace(cells=held))))
+    return ok, held, jax.tree.map(lax.stop_gradient, tally)
 
 
 def _respond(law, state, v, per_cell, dt, dx, parameters):
@@ -202,9 +258,8 @@ def parameters_of(parameters, row):
     return jax.tree.map(lambda p: sum(jnp.where(row == k, p[k], 0) for k in range(count)), parameters)
 
 
-def _only_finite(state, shape):
-    """Particles that are not finite are put at rest in the middle of the grid, without mass."""
-    ok = jnp.isfinite(sum(rows.sum(0) for rows in jax.tree.leaves(state)))
+def _only_finite(ok, state, shape):
+    """Particles that are not `ok` are put at rest in the middle of the grid, without mass."""
     rest = jax.tree.map(jnp.zeros_like, state)._replace(
         cells=jnp.broadcast_to((np.array(shape)[:, None] / 2).astype(state.cells.dtype), state.cells.shape),
         F=jnp.broadcast_to(np.eye(3, dtype=state.F.dtype).reshape(9, 1), state.F.shape),
@@ -271,9 +326,12 @@ def _apply_walls(velocity, mode, scene):
 
 
 def touched_nodes(grid: Grid, x: Float[Array, "p 3"], kernel: Kernel) -> Bool[Array, "nx ny nz"]:
-    """Nodes in the support of particles [m]."""
-    cells = jnp.clip((x - grid.origin) / grid.dx, 1, jnp.asarray(grid.shape, x.dtype) - 2)
+    """Nodes in the support of particles [m]; those outside of the grid touch none."""
+    cells = (x - grid.origin) / grid.dx
+    last = jnp.asarray(grid.shape, x.dtype) - 1
+    near = ((cells >= -1) & (cells <= last + 1)).all(1)
+    cells = jnp.clip(cells, 1, last - 1)
     first = first_nodes(cells.T, kernel, grid.shape)
     offsets = np.stack(np.meshgrid(*[np.arange(len(kernel.offsets))] * 3, indexing="ij"), -1).reshape(-1, 3)
     i, j, k = jnp.moveaxis(first[:, None] + offsets, -1, 0)
-    return jnp.zeros(grid.shape, bool).at[i, j, k].set(True)
+    return jnp.zeros(grid.shape, bool).at[i, j, k].max(near[:, None])

@@ -209,13 +209,15 @@ def _by_axis(weights):
 
 def add_windows(grid: Float[Array, "x y z k"], first, windows) -> Float[Array, "x y z k"]:
     """Grid with the windows [n n n k c] added where their first nodes [c 3] are."""
-    return lax.scatter_add(grid, first, windows, _SCATTER, mode=_IN_BOUNDS)
+    with jax.named_scope("add_windows"):
+        return lax.scatter_add(grid, first, windows, _SCATTER, mode=_IN_BOUNDS)
 
 
 def take_windows(grid: Float[Array, "x y z k"], first, kernel: Kernel) -> Float[Array, "n n n k c"]:
     """Windows of the grid at their first nodes [c 3]."""
     n = len(kernel.offsets)
-    return lax.gather(grid, first, _GATHER, (n, n, n, grid.shape[-1]), mode=_IN_BOUNDS)
+    with jax.named_scope("take_windows"):
+        return lax.gather(grid, first, _GATHER, (n, n, n, grid.shape[-1]), mode=_IN_BOUNDS)
 
 
 def _offset_axes(kernel: Kernel, ndim: int, dtype) -> list[np.ndarray]:

@@ -147,20 +147,38 @@ def test_what_outruns_its_box_is_counted(x64):
     assert int(health.first_bad_frame) == 0
 
 
-def test_a_box_is_as_large_as_a_motion_needs_and_none_where_it_would_not_pay(x64):
-    cube = particles, _ = squeezed_cube()
-    _, path, _ = thrown(cube, jnp.asarray(4.0), None)
-    side = np.ptp(np.asarray(particles.x), axis=0) / DX
-    still = make_particles(particles.x, volume=(DX / 2) ** 3, table=ELASTIC)
-    at_rest = (still, eqx.tree_at(lambda p: (p.x, p.v), path, (path.x * 0 + still.x, path.v * 0)))
+def test_a_box_holds_the_motion_that_it_was_sized_for_and_is_none_where_it_would_not_pay(x64):
+    """A cube at rest that a fast bat hits, which free flight from where it stood would not have told."""
+    particles, _ = squeezed_cube()
+    still = eqx.tree_at(lambda p: p.v, particles, jnp.zeros_like(particles.v))
+    bat = Plane(point=jnp.asarray([1.5, 0, 0]), normal=jnp.asarray([1.0, 0, 0]), velocity=jnp.asarray([8.0, 0, 0]))
+    run = partial(
+        rollout, table=ELASTIC, grid=fit_grid(particles.x, DX, margin=2.0), frames=2, frame_dt=0.04,
+        gravity=(0.0, 0.0, 0.0), colliders=(bat,),
+    )  # fmt: skip
+    end, path, _ = jax.jit(lambda still: run(still, config=SimConfig(substeps=80, devices=1)))(still)
     vast = Grid(jnp.zeros(3), jnp.asarray(DX), (64, 64, 64))
-    of_rest = boxes.box_for([at_rest], vast, 0.02, (0.0, 0.0, 0.0))
-    assert of_rest == tuple(np.ceil(1.15 * (np.ceil(side) + 6)).astype(int))
-    of_both = boxes.box_for([at_rest, (particles, path)], vast, 0.02, (0.0, 0.0, -9.8))
-    assert of_both[0] >= of_rest[0] + 1.15 * (0.02 * 4.0 / DX - 1)
-    _, _, health = jax.jit(lambda speed: thrown(cube, speed, of_both))(4.0)
+    box = boxes.box_for([(still, path, 0.04, (0.0, 0.0, 0.0))], ELASTIC, vast)
+    assert max(box) < 32
+    boxed, _, health = jax.jit(lambda still: run(still, config=SimConfig(substeps=80, devices=1, box=box)))(still)
     assert int(health.escaped) == 0
-    assert boxes.box_for([(particles, path)], fit_grid(particles.x, DX), 0.02, (0.0, 0.0, -9.8)) is None
+    assert float(jnp.abs(path.x[0] - still.x).max()) > 3 * DX  # hit in the first frame
+    np.testing.assert_allclose(boxed.x, end.x, atol=1e-8)
+    assert boxes.box_for([(still, path, 0.04, (0.0, 0.0, 0.0))], ELASTIC, fit_grid(still.x, DX)) is None
+    of_one = make_particles(jnp.ones((1, 3)), volume=1e-4, table=ELASTIC)
+    at_rest = eqx.tree_at(lambda p: (p.x, p.v), path, (jnp.ones((2, 1, 3)), jnp.zeros((2, 1, 3))))
+    assert boxes.box_for([(of_one, at_rest, 0.04, (0.0, 0.0, 0.0))], ELASTIC, vast) == (8, 8, 8)
+
+
+def test_nodes_are_where_they_are_wherever_the_grid_begins():
+    """In float32, where a layer of nodes may round to either side of a plane on it."""
+    dx = jnp.float32(0.02)
+    domain = jnp.arange(-40, 60) * dx
+    for first in range(-40, 20):
+        grid = Grid(jnp.full(3, np.float32(0.02) * np.float32(first)), dx, (16, 16, 16))
+        np.testing.assert_array_equal(grid.points[:, 0, 0, 0], domain[first + 40 : first + 56])
+    apart = Grid(jnp.asarray([0.013, 0.02, -0.4], jnp.float32), dx, (8, 8, 8)).points
+    np.testing.assert_allclose(apart[:, 0, 0, 0], 0.013 + 0.02 * np.arange(8), rtol=1e-6)
 
 
 @pytest.mark.parametrize("traced", [False, True])

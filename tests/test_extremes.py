@@ -352,6 +352,21 @@ def gradient():
     return eqx.filter_jit(jax.value_and_grad(small_number, argnums=(3, 4, 5), has_aux=True))
 
 
+def test_what_goes_wrong_at_one_time_adds_up_over_chunks_and_laws():
+    models = ("neo_hookean", "fixed_corotated")
+    table = material_table([Material(model, density=1000.0, young=2e4, poisson=0.3) for model in models])
+    particles = matter(table)
+    for index in (0, 5, 20, 40, 63):  # in three chunks of 16 and both laws
+        particles = put(particles, "x", jnp.asarray([0.5, 4.0, 0.5]), index)
+    for index in (1, 33, 50):
+        particles = put(particles, "F", jnp.diag(jnp.asarray([1.0, 1.0, -1.0])), index)
+    config = SimConfig(substeps=1, chunk=16, force=True)
+    _, _, health = rollout(
+        particles, grid_of(), table, config, frames=1, frame_dt=1e-6, gravity=(0.0, 0.0, 0.0)
+    )  # fmt: skip
+    assert (int(health.escaped), int(health.inverted), int(health.nonfinite)) == (5, 3, 0)
+
+
 @pytest.mark.parametrize("case", ["coincident", "escaped", "not a number", "flat", "heavy", "stiff", "far"])
 def test_gradients_are_finite_where_the_forward_pass_is(gradient, case):
     table, grid = table_of(), grid_of()

@@ -11,11 +11,7 @@ from pigjax.scene import load_scene
 
 FOLDER = Path(__file__).parents[1] / "examples" / "materials"
 SCENES = {path.stem: path for path in FOLDER.glob("*.toml")}
-NOT_SHOWN = {
-    "stationary": "does not move",
-    "steel": "its own modulus needs implicit steps",
-    "stone": "its own modulus needs implicit steps",
-}
+NOT_SHOWN = {"stationary": "does not move"}
 
 
 def test_every_preset_that_moves_has_a_scene():
@@ -29,7 +25,7 @@ def test_scene_shows_its_preset_on_objects_that_exist(name):
         assert scene.path(path).is_file()
     assert set(scene.objects) <= set(io.read_json(scene.path(scene.input.names)).values())
     moving = {entry.material for entry in scene.objects.values() if not entry.fixed}
-    assert moving == {name}
+    assert name in moving
 
 
 @pytest.mark.parametrize("name", sorted(SCENES))

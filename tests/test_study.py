@@ -1,6 +1,7 @@
 """A scene as a function of its parameters: the same physics as `run_scene`, and study files that sweep and tune it."""
 
 import tomllib
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -225,7 +226,26 @@ def test_a_video_is_its_own_best_match(folder, outcome, tmp_path):
     assert table["loss"][1] < 1e-10 < 1e-7 < np.delete(table["loss"], 1).min()
 
 
-def test_smaller_pictures_tell_how_far_apart_things_lie(outcome):
+@pytest.mark.slow
+def test_the_gradient_through_drawing_clamp_and_matter_is_that_of_central_differences(made, x64):
+    exact = jax.tree.map(lambda leaf: leaf.astype(float) if eqx.is_inexact_array(leaf) else leaf, made)
+    exact = replace(exact, render=replace(made.render, alpha_min=1e-7, transmittance_min=0.0))  # without jumps
+    names, at = ("objects.ball.young", "objects.ball.velocity"), np.array([5000.0, 0.4, 0.1, -1.2])
+
+    @jax.jit
+    def frames(numbers):
+        outcome = exact.with_parameters(dict(zip(names, (numbers[0], numbers[1:])))).simulate()
+        return outcome.experiment.video(outcome.trajectory)
+
+    target = frames(jnp.array([4000.0, 0.5, 0.0, -1.0]))
+    loss = jax.jit(lambda numbers: pyramid_error(frames(numbers), target, 3))
+    gradient, h = jax.grad(loss)(at), np.array([0.1, 1e-5, 1e-5, 1e-5])
+    central = [(loss(at + nudge) - loss(at - nudge)) / (2 * nudge.sum()) for nudge in np.diag(h)]
+    np.testing.assert_allclose(gradient, central, rtol=1e-4)
+    assert np.all(np.abs(central) > 0)
+
+
+def test_smaller_pictures_tell_how_far_apart_things_lie(made):
     def square(column):
         return np.pad(np.ones((1, 2, 2, 3)), ((0, 0), (4, 10), (column, 14 - column), (0, 0)))
 
@@ -242,9 +262,8 @@ def test_smaller_pictures_tell_how_far_apart_things_lie(outcome):
     for _ in range(4):
         wanted, difference = wanted + (difference**2).mean(), halved(difference)
     assert error(6, 4) == pytest.approx(wanted, rel=1e-6)
-    frames = outcome.experiment.video(outcome.trajectory)
-    with pytest.raises(SceneError, match=r"levels = 99: pictures of this size have 1 to"):
-        video(outcome, target=frames, levels=99)
+    with pytest.raises(SceneError, match=r"levels = 99: pictures of this size have 1 to 5"):
+        jax.eval_shape(lambda made: video(made.simulate(), target=jnp.zeros((3, 20, 24, 3)), levels=99), made)
 
 
 def test_own_objectives_are_read_from_files(folder, tmp_path):

@@ -37,14 +37,14 @@ COARSER = {"elastic": "dx / 1.4", "sand": "dx / 1.4", "tabletop": "standard"}
 
 
 def study(folder: Path, scenes) -> str:
-    """Tables of all scenes, and one plot in `folder`."""
-    text, panels, floors = [], {}, {}
+    """Tables of all scenes, printed as they come, and one plot in `folder`."""
+    panels, floors = {}, {}
     for name in scenes:
+        jax.clear_caches()  # compiled programs are mapped into memory piece by piece, and the pieces have a limit
         panels[name], floors[name], said = _study(name)
-        unit = "error of the distance travelled"
-        text += [f"**{name}**", said, table(panels[name], error=unit)]
+        print(f"**{name}**\n\n{said}\n\n{table(panels[name], error='error of the distance travelled')}\n")
     plot(panels, folder / PLOT, error="displacement error (share of the distance)", floors=floors)
-    return "\n\n".join([*text, f"![error against time of matter](media/{PLOT})"])
+    return f"![error against time of matter](media/{PLOT})"
 
 
 def _study(name):

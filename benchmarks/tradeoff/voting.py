@@ -16,14 +16,14 @@ PLOT = "tradeoff_voting.png"
 STANDARD = {"every": 1, "size": 256}
 SETTINGS = {
     "standard": ("standard", {}),
-    "20 views": ("views", {"every": 2}),
-    "10 views": ("views", {"every": 4}),
-    "5 views": ("views", {"every": 8}),
+    "16 views": ("views", {"every": 2}),
+    "8 views": ("views", {"every": 4}),
+    "4 views": ("views", {"every": 8}),
     "128²": ("resolution", {"size": 128}),
     "64²": ("resolution", {"size": 64}),
     "lowest id of ties": ("ties", {"ties": "lowest"}),
     "alpha·T": ("weighting", {"weighting": "alpha"}),
-    "10 views, 128²": ("views", {"every": 4, "size": 128}),
+    "8 views, 128²": ("views", {"every": 4, "size": 128}),
 }
 
 
@@ -43,7 +43,7 @@ def study(folder: Path, scenes) -> str:
     plot({"tabletop": points}, folder / PLOT, error="share of wrong ids")
     head = (
         f"{len(scene.truth)} Gaussians with known ids, {len(scene.train)} views. Reference: the truth. Which views"
-        f" they are moves the share of 10 views by {spread:.1e} (standard deviation over four disjoint sets). The small"
+        f" they are moves the share of 8 views by {spread:.1e} (standard deviation over four disjoint sets). The small"
         " scenes have one object each, so nothing to vote on."
     )
     return "\n\n".join(

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from tradeoff.errors import root_mean_square, video_psnr
@@ -19,17 +20,18 @@ SEED = {"simulation": {"seed": 1}}
 
 
 def study(folder: Path, scenes) -> str:
-    """Tables of all scenes, and one plot in `folder`."""
-    panels, floors, text = {}, {}, []
-    for name in scenes:
-        panels[name], floors[name], said = _study(name)
-        text += [f"**{name}**", said, table(panels[name], error="RMS error of colour")]
-    plot(panels, folder / PLOT, error="RMS error of colour in the video", floors=floors)
-    head = (
+    """Tables of all scenes, printed as they come, and one plot in `folder`."""
+    print(
         "Seeding, simulating and drawing; reading and voting are the same for all. Error: all frames against those of"
-        ' accuracy = "reference", smaller ones enlarged.'
+        ' accuracy = "reference", smaller ones enlarged.\n'
     )
-    return "\n\n".join([head, *text, f"![error against time of the whole pipeline](media/{PLOT})"])
+    panels, floors = {}, {}
+    for name in scenes:
+        jax.clear_caches()  # compiled programs are mapped into memory piece by piece, and the pieces have a limit
+        panels[name], floors[name], said = _study(name)
+        print(f"**{name}**\n\n{said}\n\n{table(panels[name], error='RMS error of colour')}\n")
+    plot(panels, folder / PLOT, error="RMS error of colour in the video", floors=floors)
+    return f"![error against time of the whole pipeline](media/{PLOT})"
 
 
 def _study(name):

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import time
 from contextlib import contextmanager, nullcontext
-from functools import partial
 from unittest.mock import patch
 
 import jax
@@ -62,7 +61,7 @@ def _give(setting, shape, go, cells, chunk, shared):
 
 
 def _take(setting, shape, bodies, law, go, windows, state, shared):
-    """A chunk after the step, and its health, as `substep._take`."""
+    """A chunk after the step, and its tally, as `substep._take`."""
     (dt, dx, parameters), kernel = shared, setting.kernel
 
     def moments(windows, distance):
@@ -76,7 +75,7 @@ def _take(setting, shape, bodies, law, go, windows, state, shared):
 
     distance = stage(go, lambda cells: distances(cells, kernel, shape), state.cells)
     new = stage(go, respond, state, *stage(go, moments, windows, distance), dt, dx, parameters)
-    return stage(go, partial(substep._check, shape, bodies), new, state.cells, state.volume, dt, dx)
+    return substep._settle(shape, bodies, go, new, state)
 
 
 def _figures(kernel):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +24,8 @@ def one_device_per_core() -> None:
 
     if "JAX_NUM_CPU_DEVICES" not in os.environ and "XLA_FLAGS" not in os.environ:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        jax.config.update("jax_num_cpu_devices", min(cores, _MOST_DEVICES))
+        with suppress(RuntimeError):  # who calls a command from Python may have started JAX, with what devices it has
+            jax.config.update("jax_num_cpu_devices", min(cores, _MOST_DEVICES))
 
 
 @contextmanager

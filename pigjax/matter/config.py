@@ -49,8 +49,10 @@ class SimConfig(eqx.Module):
                 raise InputError(f"SimConfig.{name} = {value!r}: choose one of {', '.join(choices)}.")
         if self.substeps is not None and self.substeps < 1:
             raise InputError(f"SimConfig.substeps = {self.substeps}: must be 1 or more.")
-        if self.box is not None and min(self.box) < 2 * WALL + 2:
-            raise InputError(f"SimConfig.box = {self.box}: every side needs {2 * WALL + 2} nodes or more.")
+        if self.box is not None and not (
+            isinstance(self.box, tuple) and len(self.box) == 3 and min(self.box) >= 2 * WALL + 2
+        ):
+            raise InputError(f"SimConfig.box = {self.box}: give three sides of {2 * WALL + 2} nodes or more.")
         if self.chunk is not None and self.chunk < 1:
             raise InputError(f"SimConfig.chunk = {self.chunk}: must be 1 or more.")
         if not 0 < self.visual_stretch[0] <= self.visual_stretch[1]:

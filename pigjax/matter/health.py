@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,7 @@ class StepHealth(eqx.Module):
 
     min_J: Float[Array, ""]  # smallest determinant of F
     max_courant: Float[Array, ""]  # longest way of a particle in one step [cells]
-    escaped: Int[Array, ""]  # particles that the domain's wall had to hold back, most at one time
+    escaped: Int[Array, ""]  # particles that the edge of the grid had to hold back, most at one time
     nonfinite: Int[Array, ""]  # particles lost to NaN or infinity
     inverted: Int[Array, ""]  # particles turned inside out, most at one time
     unconverged: Int[Array, ""]  # implicit steps whose balance was not found to SimConfig.newton_tolerance
@@ -64,6 +66,10 @@ class Health(StepHealth):
     substeps: Int[Array, ""]  # taken per frame
     first_bad_frame: Int[Array, ""]  # the first with any problem, -1 for none
 
+    def of_step(self) -> StepHealth:
+        """Without what is of a whole rollout."""
+        return StepHealth(**{field.name: getattr(self, field.name) for field in fields(StepHealth)})
+
     def _where(self) -> str:
         return f", first in frame {int(self.first_bad_frame)}"
 
@@ -74,4 +80,4 @@ def perfect_health(dtype) -> StepHealth:
     return StepHealth(jnp.full((), jnp.inf, dtype), jnp.zeros((), dtype), none, none, none, none)
 
 
-_REMEDY = "take more substeps (or a lower cfl), a larger grid, or softer or slower matter"
+_REMEDY = "take more substeps (or a lower cfl), a larger grid (or SimConfig.box), or softer or slower matter"

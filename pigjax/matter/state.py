@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from pigjax.arrays import array_field, static_field
@@ -64,9 +65,16 @@ class Grid(eqx.Module):
 
     @property
     def points(self) -> Float[Array, "nx ny nz 3"]:
-        """Positions of the nodes [m]."""
-        axes = [jnp.arange(n, dtype=self.origin.dtype) for n in self.shape]
-        return self.origin + self.dx * jnp.stack(jnp.meshgrid(*axes, indexing="ij"), -1)
+        """Positions of the nodes [m]; those of multiples of dx are the same, to the digit, wherever the grid begins.
+
+        Else a plane that lies on a layer of nodes would hold it or not as rounding will.
+        """
+        first = lax.stop_gradient(jnp.round(self.origin / self.dx))
+        rest = self.origin - self.dx * first
+        rounding = 1e-3 * self.dx + 4 * jnp.finfo(rest.dtype).eps * jnp.abs(self.origin)
+        rest -= lax.stop_gradient(jnp.where(jnp.abs(rest) < rounding, rest, 0.0))
+        axes = [jnp.arange(n, dtype=self.origin.dtype) + first[k] for k, n in enumerate(self.shape)]
+        return rest + self.dx * jnp.stack(jnp.meshgrid(*axes, indexing="ij"), -1)
 
 
 class Trajectory(eqx.Module):

@@ -233,7 +233,8 @@ def experiment(
     """Read a scene and make an experiment of it. Host.
 
     The substeps are those of the most demanding of `extremes`, and the grid holds the motion of the scene as it is and
-    of each of them: matter that goes further meets the domain's wall and is counted in `Health.escaped`.
+    of each of them. What goes further meets the domain's wall, and what is faster the edge of the box of the grid that
+    moves with matter (`SimConfig.box`): both are counted in `Health.escaped`.
 
     Args:
         scene: as `load_scene` gives it.
@@ -343,11 +344,11 @@ def _fitted(made: Experiment, dx: float, extremes: list[Mapping[str, Any]], marg
     config = choose_integrator(made.particles, near, made.table, made.config, **steps(made))
     substeps = max(choose_substeps(case.particles, near, case.table, config, **steps(case)) for case in cases)
     config = replace(config, substeps=substeps)
-    reached, paths = [np.asarray(made.particles.x)], []
+    reached, runs = [np.asarray(made.particles.x)], []
     for case in cases:
         trajectory = replace(case, config=config).simulate().trajectory
         reached.append(np.asarray(trajectory.x).reshape(-1, 3))
-        paths.append((case.particles, trajectory))
+        runs.append((case.particles, trajectory, float(case.frame_dt), case.gravity))
     grid = fit_grid(np.concatenate(reached), dx, margin=margin)
-    box = box_for(paths, grid, float(made.frame_dt), made.gravity)
+    box = box_for(runs, made.table, grid)
     return replace(made, config=replace(config, box=box), grid=grid)

@@ -1,6 +1,6 @@
 """What a study may score: pure functions of an `Outcome`, each a dictionary of scalars.
 
-One of them named "loss" is what tuning makes small. Where the simulation broke down, all are NaN.
+One of them named "loss" is what tuning makes small. Where the simulation broke down or left its grid, all are NaN.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def video(outcome: Outcome, *, target: Float[Array, "t h w 3"], levels: int = 1)
             f"objective.options.target holds frames of shape {target.shape}, the scene draws {seen.shape}: give it"
             " simulation.frames pictures (or one more, at rest) of the camera's width and height."
         )
-    if not 1 <= levels <= (most := int(np.log2(min(seen.shape[1:3]))) + 1):
+    if levels not in range(1, (most := min(seen.shape[1:3]).bit_length()) + 1):
         raise SceneError(f"objective.options.levels = {levels}: pictures of this size have 1 to {most} levels.")
     return {"loss": pyramid_error(seen, target, levels), "psnr": jnp.mean(jax.vmap(psnr)(seen, target))}
 
@@ -136,7 +136,7 @@ def objective_of(function: str, options: dict[str, Any], folder: Path) -> Object
 
 def _healthy(objective: Objective, outcome: Outcome) -> Scores:
     health = outcome.health
-    broken = (health.nonfinite > 0) | (health.max_courant >= 1)
+    broken = (health.nonfinite > 0) | (health.max_courant >= 1) | (health.escaped > 0)
     return {name: jnp.where(broken, jnp.nan, score) for name, score in objective(outcome).items()}
 
 

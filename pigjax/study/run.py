@@ -110,7 +110,9 @@ def _trial(study: Study, rows: Sequence[Row], *, soft: bool) -> tuple[Callable[.
         return _score_votes, (voting(scene, temperature=temperature),)
     if any(of_votes):
         raise SceneError("parameters: thresholds of the vote decide what is simulated: study them apart from the rest.")
-    made = experiment(scene, extremes=_ends(study, rows), regions=study.regions, alone=study.only is not None)
+    start = {name: own.start for name, own in study.parameters.items() if own.start is not None}
+    extremes = [*_ends(study, rows), start]
+    made = experiment(scene, extremes=extremes, regions=study.regions, alone=study.only is not None)
     for name in study.parameters:
         made.value(name)  # unknown names are told before anything is compiled
     objective = objective_of(study.objective.function, study.objective.options, Path(study.folder))
