@@ -58,6 +58,7 @@ def encoding():
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_identity_encoding_recovers_the_ids():
     gaussians, views = two_balls()
     fitted = encoding()

@@ -88,6 +88,7 @@ def test_derivatives_go_through_implicit_steps(x64):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_steps_that_do_not_converge_are_counted():
     particles, table = block(young=1e7, height=5.3)
     _, _, health = run(particles, table, 1, frames=8, colliders=(FLOOR,), integrator="implicit", newton_steps=1)

@@ -32,6 +32,7 @@ def test_hidden_splats_go_first_and_the_picture_stays():
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_fewer_splats_cost_less_picture_the_more_they_contribute():
     scene, camera = make_scene(count=200, degree=0)
     gaussians, cameras = gaussians_of(scene), stack_cameras([camera])

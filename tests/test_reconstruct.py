@@ -191,6 +191,7 @@ def test_masks_fit_one_object_and_leave_the_rest_out(views, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_pose_refinement_takes_back_a_shifted_camera(views):
     loaded, points = views
     train = [k for k, split in enumerate(loaded.splits) if split == "train"]

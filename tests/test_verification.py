@@ -20,6 +20,7 @@ from pigjax.mls_mpm import SimConfig, step
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_fixed_free_bar_swings_with_its_period_to_first_order_of_its_wall(x64):
     """T = 4 L/c: 2.1 % at 10 cells and 1.0 % at 20, all of it the wall's: the free bar has a fourth of it."""
     coarse, fine = (period(cells, "fixed") - 1 for cells in (10, 20))
