@@ -11,6 +11,7 @@ import pytest
 from pigjax import boxes
 from pigjax.boxes import Fit
 from pigjax.colliders import Plane
+from pigjax.contact import BodyContact
 from pigjax.errors import InputError
 from pigjax.materials import Material, material_table, preset
 from pigjax.matter import Grid, fit_grid, make_particles, vast_grid
@@ -138,6 +139,36 @@ def test_a_box_that_moves_within_jit_gives_what_the_whole_grid_gives(x64):
         np.testing.assert_allclose(b, a[:2], atol=1e-8 * max(1.0, float(np.abs(a).max())))
     np.testing.assert_allclose(slope, (value[4:] - value[2:4]) / (2 * h), rtol=1e-5)
     assert float(jnp.abs(slope).min()) > 0.1
+
+
+@pytest.mark.slow
+def test_a_moving_box_holds_for_laws_still_matter_walls_devices_and_contact(x64):
+    """Sand and a cube on a wide sheet of still matter, of which a box sees a part, near the wall of the domain."""
+    both, axis = two_cubes(), DX / 2 * np.arange(64)
+    sheet = np.stack([*(a.reshape(-1) for a in np.meshgrid(axis[:48] + 0.8, axis)), np.full(48 * 64, 0.72)], 1)
+    table = material_table([preset("sand"), Material("neo_hookean", density=500.0, young=2e4, poisson=0.3),
+                            Material("stationary", density=1000.0)])  # fmt: skip
+    particles = make_particles(
+        jnp.concatenate([both.x, jnp.asarray(sheet)]),
+        volume=(DX / 2) ** 3,
+        table=table,
+        material=np.repeat([0, 1, 2], [216, 216, len(sheet)]),
+        velocity=jnp.concatenate([both.v, jnp.zeros((len(sheet), 3))]),
+        body=np.repeat([0, 1, 1], [216, 216, len(sheet)]),
+    )
+    grid = Grid(jnp.asarray([0.75, 0.0, 0.0]), jnp.asarray(DX), (29, 36, 24))
+    around = {"frames": 4, "frame_dt": 0.02, "gravity": (-60.0, 0.0, -9.8)}
+
+    def end(box, devices, contact):
+        config = SimConfig(substeps=40, box=box, devices=devices)
+        return jax.jit(lambda p: rollout(p, grid, table, config, contact=contact, **around))(particles)
+
+    for devices, contact in ((2, None), (1, BodyContact(bodies=2))):
+        (whole, path, health), (boxed, path_b, health_b) = (end(box, devices, contact) for box in (None, (26, 20, 18)))
+        assert float(whole.x[:216, 0].min()) < 0.75 + 4 * DX  # the wall's nodes are those up to 3 dx
+        assert int(health.escaped) == int(health_b.escaped) == 0
+        assert_same(whole, boxed, 1e-7)
+        np.testing.assert_allclose(path.F_visual, path_b.F_visual, atol=1e-7)
 
 
 def test_what_outruns_its_box_is_counted(x64):
