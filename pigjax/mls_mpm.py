@@ -236,6 +236,7 @@ def _check_steps(frames, frame_dt, gravity):
         raise InputError(f"frames = {frames}: must be 1 or more.")
     if _is_traced(frame_dt, gravity):
         return
+    frame_dt = float(frame_dt)  # known also where jit closes over it, which a comparison of JAX's would not be
     if not (math.isfinite(frame_dt) and frame_dt >= 0):
         raise InputError(f"frame_dt = {frame_dt}: the time between frames must be >= 0 s, and finite.")
     if not np.isfinite(np.asarray(gravity)).all():
