@@ -120,7 +120,7 @@ def two() -> None:
         only=["table", "duck", "soccerball"], overrides=view, extremes=[{"objects.duck.young": STIFF.high}]
     )
     target = film(arrays(TWO), made)
-    best, history, seconds = descend(made, target, TWO_START, steps=80, levels=5)
+    best, history, seconds = descend(made, target, TWO_START, steps=120, levels=5)
     report(TWO, TWO_START, best, history, seconds)
 
 

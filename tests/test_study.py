@@ -200,7 +200,7 @@ def test_tuning_finds_the_throw_that_hits(folder, tmp_path):
         scene="flight.toml",
         objective={"function": "aim", "options": {"object": "ball", "target": [0.2, 0.1, 0.35]}},
         parameters={"objects.ball.velocity": {"low": -4.0, "high": 4.0}},
-        tune={"rate": 0.4, "steps": 40},
+        tune={"rate": 0.4, "steps": 60},
     )
     said = CliRunner().invoke(app, ["tune", str(path), "-o", str(tmp_path)])
     assert said.exit_code == 0, said.output

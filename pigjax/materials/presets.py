@@ -10,8 +10,8 @@ from pigjax.materials.table import Material
 
 # Densities, angles, yield stresses of soft matter and viscosities are those of the real matter. Moduli of stiff matter
 # (and the yield stress of metal) are lowered to what explicit steps afford: its waves are slower, its rest shapes and
-# its flow look the same. Steel and stone keep their own moduli, whose explicit steps would be less than a microsecond
-# on a grid of a centimetre: they are for the implicit integrator.
+# its flow look the same. Steel and stone keep their own moduli, whose explicit steps are about a microsecond on a grid
+# of a centimetre: they are for slow motion, or for the implicit integrator.
 PRESETS: dict[str, dict[str, Any]] = {
     "jelly": {"model": "fixed_corotated", "density": 1000.0, "young": 2e4, "poisson": 0.4},
     "rubber": {"model": "neo_hookean", "density": 1100.0, "young": 5e5, "poisson": 0.45},

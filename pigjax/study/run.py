@@ -111,7 +111,7 @@ def _trial(study: Study, rows: Sequence[Row], *, soft: bool) -> tuple[Callable[.
     if any(of_votes):
         raise SceneError("parameters: thresholds of the vote decide what is simulated: study them apart from the rest.")
     start = {name: own.start for name, own in study.parameters.items() if own.start is not None}
-    extremes = [*_ends(study, rows), start]
+    extremes = [*_ends(study, rows), *([start] if start else [])]
     made = experiment(scene, extremes=extremes, regions=study.regions, alone=study.only is not None)
     for name in study.parameters:
         made.value(name)  # unknown names are told before anything is compiled
