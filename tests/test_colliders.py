@@ -452,3 +452,12 @@ def test_bad_colliders_are_refused_by_field(message):
 def test_whole_numbers_are_taken_as_real_ones():
     box = Box((-1, -1, -1), np.array([1, 1, 1]), velocity=[0, 0, 1])
     assert float(box.distance(jnp.asarray([[0.0, 0.0, 3.0]]), 1.5)[0]) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("glide", [0.0, 1e-30, 1e-21, 1e-12, 0.3, 3.0])
+def test_what_hardly_glides_has_a_finite_slope(glide):
+    plane = Plane(point=jnp.zeros(3), normal=jnp.asarray([0.0, 0.0, 1.0]), friction=jnp.float32(0.4))
+    contact = plane.contact(jnp.asarray([[0.0, 0.0, -0.1]]))
+    slope = jax.jacobian(lambda v: plane.apply(contact, v[None])[0])(jnp.asarray([glide, 0.0, -1.0], jnp.float32))
+    assert np.isfinite(slope).all()
+    assert float(slope[0, 0]) == (1.0 if glide > 0.4 else 0.0)

@@ -150,7 +150,9 @@ class Collider(eqx.Module):
             return tangential
         glide = safe_norm(tangential)[..., None]
         # Coulomb: the tangential impulse is at most the friction coefficient times the normal one, which is -speed.
-        kept = jnp.maximum(1 + self.friction * speed / jnp.where(glide > 0, glide, 1.0), 0.0)
+        # What is too slow to glide is not divided by: the slope at next to no glide would be infinite times nothing.
+        glides = (speed < 0) & (glide >= -self.friction * speed)
+        kept = jnp.where(glides, 1 + self.friction * speed / jnp.where(glides & (glide > 0), glide, 1.0), 0.0)
         return jnp.where(speed < 0, kept * tangential, relative)
 
     def _distance_and_normals(self, points, time):
