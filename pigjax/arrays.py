@@ -1,16 +1,22 @@
-"""Field helpers shared by the pytrees: static fields, and conversion of plain numbers. Leaf."""
+"""Field helpers shared by the pytrees, conversion of plain numbers, and products in full precision. Leaf."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 Vector: TypeAlias = Float[Array, "3"] | Float[np.ndarray, "3"] | Sequence[float]
 Scalar: TypeAlias = Float[Array, ""] | float
+
+# accelerators round float32 factors to TF32, whose mantissa has ten bits, unless told otherwise
+matmul = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
+einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 
 
 def as_array(value: Any) -> Any:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pigjax.arrays import Vector, array_field, static_field
+from pigjax.arrays import Vector, array_field, einsum, matmul, static_field
 from pigjax.linalg import quat_to_matrix
 
 
@@ -56,7 +56,7 @@ class Camera(eqx.Module):
         """The camera turned by a small rotation vector and shifted, both in its own axes [rad, m]."""
         half = twist[..., :3] / 2
         rotation = quat_to_matrix(jnp.concatenate([jnp.ones_like(half[..., :1]), half], -1))
-        moved = jnp.einsum("...ij,...jk->...ik", rotation, self.world_to_cam[..., :3, :])
+        moved = einsum("...ij,...jk->...ik", rotation, self.world_to_cam[..., :3, :])
         moved = moved.at[..., 3].add(twist[..., 3:])
         world_to_cam = self.world_to_cam.at[..., :3, :].set(moved)
         return Camera(world_to_cam, self.focal, self.centre, self.width, self.height)
@@ -83,14 +83,14 @@ def look_at(
     right = right / jnp.linalg.norm(right)
     rotation = jnp.stack([right, jnp.cross(forward, right), forward])
     dtype = position.dtype
-    world_to_cam = jnp.eye(4, dtype=dtype).at[:3, :3].set(rotation).at[:3, 3].set(-rotation @ position)
+    world_to_cam = jnp.eye(4, dtype=dtype).at[:3, :3].set(rotation).at[:3, 3].set(-matmul(rotation, position))
     size = jnp.asarray([width, height], dtype)
     return Camera(world_to_cam, jnp.full(2, focal, dtype), size / 2, width, height)
 
 
 def to_camera(points: Float[Array, "*n 3"], camera: Camera) -> Float[Array, "*n 3"]:
     """World points in the frame of one camera [m]."""
-    return points @ camera.world_to_cam[:3, :3].T + camera.world_to_cam[:3, 3]
+    return matmul(points, camera.world_to_cam[:3, :3].T) + camera.world_to_cam[:3, 3]
 
 
 def project(points: Float[Array, "*n 3"], camera: Camera) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"]]:
@@ -108,7 +108,7 @@ def unproject(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "h w 3
     x, y = jnp.broadcast_arrays(x[None, :], y[:, None])
     local = jnp.stack([x, y, jnp.ones_like(x)], -1) * depth[..., None]
     rotation, translation = camera.world_to_cam[:3, :3], camera.world_to_cam[:3, 3]
-    return (local - translation) @ jnp.linalg.inv(rotation).T
+    return matmul(local - translation, jnp.linalg.inv(rotation).T)
 
 
 def orbit(
@@ -140,7 +140,7 @@ def orbit(
     """
     above = np.asarray(up, float) / np.linalg.norm(np.asarray(up, float))
     reference = np.eye(3)[0] if abs(above[0]) < 0.9 else np.eye(3)[2]
-    first = reference - above * (reference @ above)
+    first = reference - above * matmul(reference, above)
     first /= np.linalg.norm(first)
     azimuth = start + sweep * np.arange(frames) / frames
     around = np.cos(azimuth)[:, None] * first + np.sin(azimuth)[:, None] * np.cross(above, first)
@@ -175,8 +175,8 @@ def interpolate_path(keys: Camera, frames: int) -> Camera:
     rotation = mix(keys.world_to_cam[:, :3, :3])
     position = mix(keys.position)
     u, _, vt = jnp.linalg.svd(rotation)
-    rotation = u @ vt
+    rotation = matmul(u, vt)
     world_to_cam = jnp.zeros((frames, 4, 4), rotation.dtype).at[:, 3, 3].set(1.0)
     world_to_cam = world_to_cam.at[:, :3, :3].set(rotation)
-    world_to_cam = world_to_cam.at[:, :3, 3].set(-jnp.einsum("fij,fj->fi", rotation, position))
+    world_to_cam = world_to_cam.at[:, :3, 3].set(-einsum("fij,fj->fi", rotation, position))
     return Camera(world_to_cam, mix(keys.focal), mix(keys.centre), keys.width, keys.height)

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import functools
-
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from pigjax.arrays import matmul
 from pigjax.lists import SHAPE_COLUMNS, BlendConfig
 
 TERMS = 6  # of a polynomial of degree two in the plane; the features stand behind them
 _NOWHERE = np.array([-1e4, 0, 0, 0, 0, 0])  # polynomial of a splat whose alpha is 0
-
-# accelerators round float32 factors to TF32 unless told otherwise
-product = functools.partial(jnp.matmul, precision=lax.Precision.HIGHEST)
 
 
 def as_tiles_see(rows: Float[Array, "s k"], tile: Int[Array, "s"], config: BlendConfig) -> Float[Array, "s k"]:
@@ -36,7 +32,7 @@ def tile_alphas(rows, valid, config: BlendConfig):
     """Alpha [chunk pixels] of each splat at each pixel of a tile, and its value before the alpha_max clamp."""
     # a product, since XLA would read the list anew for every pixel of a sum
     polynomial = jnp.where(valid[:, None], rows[:, :TERMS], jnp.asarray(_NOWHERE, rows.dtype))
-    exponent = product(polynomial, monomials(config, rows.dtype))
+    exponent = matmul(polynomial, monomials(config, rows.dtype))
     unclamped = jnp.exp(exponent)
     alpha = jnp.minimum(unclamped, config.alpha_max)
     return jnp.where(alpha >= config.alpha_min, alpha, 0.0), unclamped

@@ -18,6 +18,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from pigjax.arrays import matmul
+
 Matrices = Float[Array, "*b 3 3"]
 Vectors = Float[Array, "*b 3"]
 Quaternions = Float[Array, "*b 4"]
@@ -54,7 +56,7 @@ def aligned_svd(matrix: Matrices) -> tuple[Matrices, Vectors, Matrices]:
     u, s, v = svd(matrix)
     overlap = jnp.swapaxes(lax.stop_gradient(v), -1, -2).reshape(*v.shape[:-2], 9)
     orders = jnp.asarray(_CUBE_ROTATIONS, v.dtype)
-    traces = jnp.matmul(overlap, orders.reshape(24, 9).T, precision=lax.Precision.HIGHEST)
+    traces = matmul(overlap, orders.reshape(24, 9).T)
     order = orders[jnp.argmax(traces, -1)]
     return matmul3(u, order), (jnp.abs(order) * s[..., None]).sum(-2), matmul3(v, order)
 

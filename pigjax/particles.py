@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
-from pigjax.arrays import array_field
+from pigjax.arrays import array_field, einsum
 from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.colliders import Collider
 from pigjax.errors import InputError
@@ -285,10 +285,10 @@ def deform(
     F = particles.F_visual.at[row].get(mode="clip")
     if binding is not None:
         carriers = particles.F_visual[binding.particles]
-        reached = particles.x[binding.particles] + jnp.einsum("mkij,mkj->mki", carriers, binding.offsets)
+        reached = particles.x[binding.particles] + einsum("mkij,mkj->mki", carriers, binding.offsets)
         index = jnp.concatenate([index, binding.gaussian])
-        x = jnp.concatenate([x, jnp.einsum("mk,mki->mi", binding.weights, reached)])
-        F = jnp.concatenate([F, jnp.einsum("mk,mkij->mij", binding.weights, carriers)])
+        x = jnp.concatenate([x, einsum("mk,mki->mi", binding.weights, reached)])
+        F = jnp.concatenate([F, einsum("mk,mkij->mij", binding.weights, carriers)])
 
     moving = jax.tree.map(lambda values: values.at[index].get(mode="clip"), gaussians)
     posed = eigen_clamp(eqx.tree_at(lambda g: g.means, moving, x), F, params, mode=mode)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from pigjax.arrays import einsum
 from pigjax.linalg import quat_to_matrix
 from pigjax.splat import Gaussians
 
@@ -58,5 +59,5 @@ def shake(gaussians: Gaussians, key: PRNGKeyArray, scale: Float[Array, ""] | flo
     faint = jax.nn.sigmoid(-100 * (jax.nn.sigmoid(gaussians.logit_opacities) - DEAD_OPACITY))
     noise = jax.random.normal(key, gaussians.means.shape, gaussians.means.dtype) * (faint * scale)[:, None]
     rotation = quat_to_matrix(gaussians.quats)
-    local = jnp.einsum("nji,nj->ni", rotation, noise) * jnp.exp(2 * gaussians.log_scales)
-    return eqx.tree_at(lambda g: g.means, gaussians, gaussians.means + jnp.einsum("nij,nj->ni", rotation, local))
+    local = einsum("nji,nj->ni", rotation, noise) * jnp.exp(2 * gaussians.log_scales)
+    return eqx.tree_at(lambda g: g.means, gaussians, gaussians.means + einsum("nij,nj->ni", rotation, local))

@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from pigjax.arrays import array_field, static_field
+from pigjax.arrays import array_field, einsum, static_field
 from pigjax.bands import collect, spread
 from pigjax.camera import Camera, stack_cameras, to_camera
 from pigjax.errors import InputError
@@ -249,9 +249,9 @@ def colours(splats: Splats, camera: Camera, sh_degree: int | None = None) -> Flo
         return jnp.maximum(_SH_CONSTANT * splats.sh[:, 0] + 0.5, 0.0)
     directions = safe_normalize(splats.means - camera.position)
     if splats.sh_rotations is not None:
-        directions = jnp.einsum("nij,ni->nj", splats.sh_rotations, directions)
+        directions = einsum("nij,ni->nj", splats.sh_rotations, directions)
     basis = sh_basis(directions, degree)
-    return jnp.maximum(jnp.einsum("nk,nkc->nc", basis, splats.sh[:, : basis.shape[1]]) + 0.5, 0.0)
+    return jnp.maximum(einsum("nk,nkc->nc", basis, splats.sh[:, : basis.shape[1]]) + 0.5, 0.0)
 
 
 def normals(splats: Splats, camera: Camera) -> Float[Array, "n 3"]:
@@ -303,7 +303,7 @@ def project_splats(splats: Splats, camera: Camera, config: RenderConfig) -> Proj
     margin_x, margin_y = _FOV_MARGIN * camera.width / (2 * fx), _FOV_MARGIN * camera.height / (2 * fy)
     held_u = jnp.clip(u, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
     held_v = jnp.clip(v, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
-    rotated = jnp.einsum("ij,njk->ink", camera.world_to_cam[:3, :3], splats.factors)
+    rotated = einsum("ij,njk->ink", camera.world_to_cam[:3, :3], splats.factors)
     row_x = (rotated[0] - held_u[:, None] * rotated[2]) * (fx / z)[:, None]
     row_y = (rotated[1] - held_v[:, None] * rotated[2]) * (fy / z)[:, None]
     a, b, c = (jnp.sum(p * q, 1) for p, q in ((row_x, row_x), (row_x, row_y), (row_y, row_y)))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, Integer
 
+from pigjax.arrays import matmul
 from pigjax.camera import Camera
 from pigjax.chunks import Chunks, all_chunks, walk
 from pigjax.lists import BlendConfig, front_to_back
@@ -43,7 +44,7 @@ def soft_surface_depth(
     def shares(chunk: Chunks, alpha, before, after):
         # the splat that closes a pixel is not blended, yet it may be the surface
         share = jnp.where(before > config.transmittance_min, passed(after) - passed(before), 0.0)
-        return jnp.stack([chunk.rows[:, _DEPTH] @ share, jnp.sum(share, 0)])
+        return jnp.stack([matmul(chunk.rows[:, _DEPTH], share), jnp.sum(share, 0)])
 
     parts = walk(chunks, jnp.any(chunks.valid, 1), blending, shares)
     depth, presence = _image(jax.ops.segment_sum(parts, chunks.tile, blending.tiles), blending)

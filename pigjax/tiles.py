@@ -21,9 +21,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from pigjax.arrays import matmul
 from pigjax.bands import in_bands
 from pigjax.chunks import all_chunks, walk
-from pigjax.footprints import TERMS, as_tiles_see, blend_chunk, crossing, monomials, product, tile_alphas
+from pigjax.footprints import TERMS, as_tiles_see, blend_chunk, crossing, monomials, tile_alphas
 from pigjax.lists import (
     SHAPE_COLUMNS,
     BlendConfig,
@@ -163,9 +164,9 @@ def _forward(table, boxes: Boxes, tau, config: BlendConfig):
         before, weight, behind = blend_chunk(alpha, through, config)
         values = rows[:, TERMS:].T
         if not config.surface:
-            return behind, planes + product(values, weight)
-        picked = product(values[-1:], crossing(before, alpha, tau, config).astype(dtype))
-        return behind, planes + jnp.concatenate([product(values[:-1], weight), picked])
+            return behind, planes + matmul(values, weight)
+        picked = matmul(values[-1:], crossing(before, alpha, tau, config).astype(dtype))
+        return behind, planes + jnp.concatenate([matmul(values[:-1], weight), picked])
 
     def visit(lists, state):
         rows = _in_list_order(table, lists, config)
@@ -194,9 +195,9 @@ def _by_scan(table, boxes: Boxes, tau, config: BlendConfig):
         weight = jnp.where(after > config.transmittance_min, alpha * before, 0.0)
         values = chunk.rows[:, TERMS:].T
         if not config.surface:
-            return product(values, weight)
-        picked = product(values[-1:], crossing(before, alpha, tau, config).astype(table.dtype))
-        return jnp.concatenate([product(values[:-1], weight), picked])
+            return matmul(values, weight)
+        picked = matmul(values[-1:], crossing(before, alpha, tau, config).astype(table.dtype))
+        return jnp.concatenate([matmul(values[:-1], weight), picked])
 
     parts = walk(chunks, jnp.any(chunks.valid, 1), config, visit)
     return jax.ops.segment_sum(parts, chunks.tile, config.tiles), overflow
@@ -222,7 +223,7 @@ def _composite_bwd(config: BlendConfig, saved, cotangents):
 
     def walk_chunk(rows, valid, through, prefix, total, towards):
         alpha, unclamped = tile_alphas(rows, valid, config)
-        gain = product(rows[:, TERMS : TERMS + blended], towards[:blended])
+        gain = matmul(rows[:, TERMS : TERMS + blended], towards[:blended])
 
         def one(carry, splat):
             before, prefix = carry
@@ -236,9 +237,9 @@ def _composite_bwd(config: BlendConfig, saved, cotangents):
         slope = weight * gain - (total - prefix) * (alpha / (1 - alpha))
         slope = jnp.where((weight > 0) & (unclamped < config.alpha_max), slope, 0.0)
         # the exponent is linear in its coefficients, so their gradients are moments of the pixel grid
-        columns = [product(slope, pixel_terms.T), product(weight, towards[:blended].T)]
+        columns = [matmul(slope, pixel_terms.T), matmul(weight, towards[:blended].T)]
         if config.surface:
-            columns.append(product(crossing(before, alpha, tau, config).astype(dtype), towards[blended:].T))
+            columns.append(matmul(crossing(before, alpha, tau, config).astype(dtype), towards[blended:].T))
         return behind, end, jnp.concatenate(columns, 1)
 
     def visit(lists, state):

@@ -87,6 +87,17 @@ def test_only_io_opens_files_for_users():
         assert "open" not in calls, path
 
 
+def test_products_keep_full_precision():
+    host = {"starts", "solids", "shells", "association", "io"}  # float64 of NumPy
+    rounded = {"matmul", "einsum", "dot", "vdot", "tensordot", "inner"}  # to TF32, on accelerators
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.BinOp | ast.AugAssign) and isinstance(node.op, ast.MatMult):
+                assert room(path) in host, f"{path}:{node.lineno}: use arrays.matmul"
+            if isinstance(node, ast.Attribute) and node.attr in rounded and ast.unparse(node.value) == "jnp":
+                assert room(path) == "arrays", f"{path}:{node.lineno}: use arrays.{node.attr}"
+
+
 def test_modules_are_short():
     for path in MODULES:
         assert len(path.read_text().splitlines()) <= 420, f"{path.name}: one idea each, about 400 lines"

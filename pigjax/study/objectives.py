@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pigjax import io
+from pigjax.arrays import matmul
 from pigjax.errors import InputError, MissingFileError, SceneError
 from pigjax.linalg import svd
 from pigjax.metrics import psnr
@@ -33,7 +34,7 @@ def motion(outcome: Outcome) -> Scores:
     particles, health = outcome.particles, outcome.health
     for name, rows in outcome.experiment.rows:
         share = _share(outcome, rows)
-        middle, velocity = share @ particles.x, share @ particles.v
+        middle, velocity = matmul(share, particles.x), matmul(share, particles.v)
         scores |= {f"{name}.{axis}": middle[k] for k, axis in enumerate("xyz")}
         scores[f"{name}.speed"] = jnp.linalg.norm(velocity)
     return scores | {"min_J": health.min_J, "max_courant": health.max_courant, "escaped": health.escaped * 1.0}
@@ -47,7 +48,7 @@ def aim(outcome: Outcome, *, object: str, target: Any, frame: int = -1) -> Score
     rows = dict(outcome.experiment.rows)
     if object not in rows:
         raise SceneError(f"objective.options.object = {object!r}: {suggest(object, rows)}.")
-    middle = _share(outcome, rows[object]) @ outcome.trajectory.x[frame]
+    middle = matmul(_share(outcome, rows[object]), outcome.trajectory.x[frame])
     wanted = np.asarray(target, float)
     off = jnp.where(np.isnan(wanted), 0.0, middle - np.nan_to_num(wanted))
     squared = jnp.sum(off**2)
