@@ -34,4 +34,5 @@ def machine() -> str:
     info = Path("/proc/cpuinfo")
     names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
     name = f"{names[0]}, {len(names)} cores" if names else platform.processor()
-    return f"{name}; jax {jax.__version__} on {jax.local_device_count()} {jax.default_backend()} device(s)"
+    devices = jax.local_devices()
+    return f"{name}; jax {jax.__version__} on {len(devices)} device(s): {devices[0].device_kind}"

@@ -195,11 +195,11 @@ print(machine())
 if options.settings:
     settings()
 if options.growth:
-    growth(options.devices)
+    growth(jax.local_device_count())
 if not (options.settings or options.growth):
     for text in options.rows:
         rivals(text)
-        for bands in sorted({1, options.devices}):
+        for bands in sorted({1, jax.local_device_count()}):
             row(text, bands)
         if options.stages:
             stages(text)
