@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from pigjax.footprints import as_tiles_see, tile_alphas
+from pigjax.footprints import as_tiles_see, tile_alphas, transmittances
 from pigjax.lists import SHAPE_COLUMNS, BlendConfig, Boxes, TileLists, count_pairs, list_pass
 
 
@@ -69,9 +69,8 @@ def walk(chunks: Chunks, needed: Bool[Array, "c"], config: BlendConfig, visit: C
 
     def blend_chunk(transmittance, chunk: Chunks):
         alpha, _ = tile_alphas(chunk.rows, chunk.valid, config)
-        _, after = lax.scan(lambda t, a: (t * (1 - a),) * 2, transmittance, alpha)
-        before = jnp.concatenate([transmittance[None], after[:-1]])
-        return after[-1], visit(chunk, alpha, before, after)
+        before, behind = transmittances(alpha, transmittance, config)
+        return behind, visit(chunk, alpha, before, jnp.concatenate([before[1:], behind[None]]))
 
     def skip(transmittance, chunk: Chunks):
         return transmittance, jnp.zeros(result.shape, result.dtype)

@@ -45,11 +45,29 @@ def monomials(config: BlendConfig, dtype) -> Float[Array, "6 p"]:
     return jnp.asarray(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]), dtype)
 
 
+def transmittances(alpha, through, config: BlendConfig):
+    """Transmittance [chunk pixels] before each splat of a chunk, and behind all of them."""
+    if not config.by_products:
+        behind, before = lax.scan(lambda t, a: (t * (1 - a), t), through, alpha)
+        return before, behind
+    # the same product as a sum of logarithms: one kernel instead of one for each splat
+    count = alpha.shape[0]
+    at = through * jnp.exp(matmul(jnp.tri(count + 1, count, -1, alpha.dtype), jnp.log1p(-alpha)))
+    return at[:-1], at[-1]
+
+
 def blend_chunk(alpha, through, config: BlendConfig):
-    """Transmittance before each splat of a chunk and behind all of them, and the weights alpha·T."""
-    behind, before = lax.scan(lambda t, a: (t * (1 - a), t), through, alpha)
+    """As `transmittances`, and the weights alpha·T between the two."""
+    before, behind = transmittances(alpha, through, config)
     weight = alpha * before
     return before, jnp.where(before - weight > config.transmittance_min, weight, 0.0), behind
+
+
+def running_sums(start, values, config: BlendConfig):
+    """`start` and the values of a chunk [chunk pixels] summed up to each splat, itself included."""
+    if config.by_products:
+        return start + matmul(jnp.tri(values.shape[0], dtype=values.dtype), values)
+    return lax.scan(lambda total, value: (total + value,) * 2, start, values)[1]
 
 
 def crossing(before, alpha, tau, config: BlendConfig):

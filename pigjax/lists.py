@@ -50,6 +50,7 @@ class BlendConfig(eqx.Module):
     slots: int = static_field()  # box/tile pairs sorted in one pass
     capacity: int | None = static_field()  # box/tile pairs listed for an image or band, None for all that are seen
     tiles_at_once: int = static_field()
+    by_products: bool = static_field()  # a chunk's running products and sums as matrix products, not splat by splat
     bands: int = static_field()  # devices that share the image
     alpha_min: float = static_field()
     alpha_max: float = static_field()

@@ -233,6 +233,7 @@ def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: b
         slots=slots_of(count, tiles, config.capacity, limit),
         capacity=config.capacity,
         tiles_at_once=config.tiles_at_once or (1 if on_cpu else 2048),
+        by_products=not on_cpu,
         bands=bands_of(camera, config),
         alpha_min=config.alpha_min,
         alpha_max=config.alpha_max,

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 from pigjax.arrays import matmul
 from pigjax.bands import in_bands
 from pigjax.chunks import all_chunks, walk
-from pigjax.footprints import TERMS, as_tiles_see, blend_chunk, crossing, monomials, tile_alphas
+from pigjax.footprints import TERMS, as_tiles_see, blend_chunk, crossing, monomials, running_sums, tile_alphas
 from pigjax.lists import (
     SHAPE_COLUMNS,
     BlendConfig,
@@ -225,22 +225,15 @@ def _composite_bwd(config: BlendConfig, saved, cotangents):
         alpha, unclamped = tile_alphas(rows, valid, config)
         gain = matmul(rows[:, TERMS : TERMS + blended], towards[:blended])
 
-        def one(carry, splat):
-            before, prefix = carry
-            alpha, gain = splat
-            weight = alpha * before
-            weight = jnp.where(before - weight > config.transmittance_min, weight, 0.0)
-            prefix = prefix + weight * gain
-            return (before * (1 - alpha), prefix), (before, weight, prefix)
-
-        (behind, end), (before, weight, prefix) = lax.scan(one, (through, prefix), (alpha, gain))
+        before, weight, behind = blend_chunk(alpha, through, config)
+        prefix = running_sums(prefix, weight * gain, config)
         slope = weight * gain - (total - prefix) * (alpha / (1 - alpha))
         slope = jnp.where((weight > 0) & (unclamped < config.alpha_max), slope, 0.0)
         # the exponent is linear in its coefficients, so their gradients are moments of the pixel grid
         columns = [matmul(slope, pixel_terms.T), matmul(weight, towards[:blended].T)]
         if config.surface:
             columns.append(matmul(crossing(before, alpha, tau, config).astype(dtype), towards[blended:].T))
-        return behind, end, jnp.concatenate(columns, 1)
+        return behind, prefix[-1], jnp.concatenate(columns, 1)
 
     def visit(lists, state):
         *state, gradient = state

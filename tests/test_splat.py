@@ -1,5 +1,6 @@
 """The renderer against a dense float64 compositor, gsplat's own numbers, and central differences."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import equinox as eqx
@@ -12,8 +13,18 @@ from dense import dense_render
 import pigjax.splat as splat_module
 from pigjax.camera import Camera, look_at
 from pigjax.errors import InputError
+from pigjax.footprints import blend_chunk, running_sums, transmittances
 from pigjax.lists import Boxes, count_pairs, front_to_back, list_pass, pairs_in_open_tiles
-from pigjax.splat import OUTPUTS, Gaussians, RenderConfig, project_splats, render, required_capacity, surface_depth
+from pigjax.splat import (
+    OUTPUTS,
+    Gaussians,
+    RenderConfig,
+    blend_config,
+    project_splats,
+    render,
+    required_capacity,
+    surface_depth,
+)
 
 EXACT = RenderConfig(alpha_min=1e-7, transmittance_min=0.0)
 DEFAULT = RenderConfig()
@@ -564,3 +575,36 @@ def test_unknown_output_and_missing_object_weights_are_clear_errors():
     bad = Gaussians(np.zeros((1, 3)), np.zeros((1, 3)), np.ones((1, 4)), np.zeros(1), np.zeros((1, 5, 3)))
     with pytest.raises(InputError, match="5 coefficients"):
         render(bad, camera)
+
+
+def test_a_chunks_running_products_and_sums_are_the_same_as_matrix_products(x64):
+    """The form that accelerators use, with splats as opaque as they get and with none at all."""
+    rng = np.random.default_rng(4)
+    alpha = rng.uniform(0, 0.99, (64, 9)) * rng.integers(0, 2, (64, 9))
+    alpha[:, 0], alpha[:, 1] = 0.0, 0.99
+    through, gain = rng.uniform(0.2, 1, 9), rng.normal(size=(64, 9))
+    _, camera = make_scene(count=1)
+    by_scan = blend_config(camera, RenderConfig(), 1, surface=False)
+    by_products = replace(by_scan, by_products=True)
+    assert not by_scan.by_products
+    for a, b in zip(blend_chunk(alpha, through, by_scan), blend_chunk(alpha, through, by_products), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-12)
+    light = np.cumprod(np.concatenate([through[None], 1 - alpha]), axis=0)
+    np.testing.assert_allclose(transmittances(alpha, through, by_products)[0], light[:-1], rtol=1e-12)
+    for config in (by_scan, by_products):
+        np.testing.assert_allclose(running_sums(through, gain, config), through + np.cumsum(gain, 0), atol=1e-12)
+
+
+def test_pictures_and_gradients_are_those_of_the_form_for_accelerators(x64, monkeypatch):
+    scene, camera = make_scene(count=40, degree=0)
+    gaussians = gaussians_of(scene)
+
+    def both():
+        return jax.jit(jax.value_and_grad(lambda g: (render(g, camera, outputs=("rgb",)).rgb ** 2).sum()))(gaussians)
+
+    on_cpu = both()
+    plain = splat_module.blend_config
+    ours = {"by_products": True, "tiles_at_once": 64}
+    monkeypatch.setattr(splat_module, "blend_config", lambda *args, **other: replace(plain(*args, **other), **ours))
+    for a, b in zip(jax.tree.leaves(on_cpu), jax.tree.leaves(both()), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-10 * float(jnp.abs(a).max()))
