@@ -8,8 +8,12 @@ from jaxtyping import install_import_hook
 hook = install_import_hook("pigjax", "beartype.beartype")
 os.environ.setdefault("PIGJAX_SHORT", "1")  # notebooks run in their short form
 flags = os.environ.get("XLA_FLAGS")
-# the workers share the cores already, so threads that compile beside each other only cost
-os.environ["XLA_FLAGS"] = f"{flags or ''} --xla_cpu_parallel_codegen_split_count=1"
+# Tests compile far more than they compute: code that is not optimised takes half the processor time. Notebooks and the
+# commands that tests start are compiled as users' are, and XLA_FLAGS given from outside count more.
+quick = (
+    "--xla_cpu_parallel_codegen_split_count=1 --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+)
+os.environ["XLA_FLAGS"] = f"{quick} {flags or ''}"
 
 import jax  # noqa: E402  (the hook must be installed before pigjax is imported)
 import pytest  # noqa: E402
@@ -28,6 +32,13 @@ def x64():
     """Run one test in float64, and leave the global setting as it was."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture
+def two_devices():
+    """Skip one test where JAX has a single device, as with one accelerator."""
+    if jax.local_device_count() < 2:
+        pytest.skip(f"needs two devices, and JAX has one: {jax.devices()[0].device_kind}")
 
 
 def _share_of_mappings() -> float:

@@ -73,7 +73,7 @@ def test_a_box_that_matter_outruns_is_made_larger(x64, monkeypatch):
     assert_same(moved, whole, 1e-9)
 
 
-def test_two_devices_give_what_one_gives(x64):
+def test_two_devices_give_what_one_gives(x64, two_devices):
     particles, grid = two_cubes(), fit_grid(np.asarray(two_cubes().x), DX, margin=0.3)
     one, path_1, health_1 = rollout(particles, grid, TABLE, SimConfig(substeps=16, devices=1), frames=4, **STEPS)
     two, path_2, health_2 = rollout(particles, grid, TABLE, SimConfig(substeps=16, devices=2), frames=4, **STEPS)
@@ -99,7 +99,7 @@ def height(young, speed, **config):
 
 
 @pytest.mark.slow
-def test_every_mode_and_number_of_devices_gives_the_same_derivatives(x64):
+def test_every_mode_and_number_of_devices_gives_the_same_derivatives(x64, two_devices):
     one, two = (jax.grad(partial(height, devices=devices), (0, 1))(2e4, 0.1) for devices in (1, 2))
     np.testing.assert_allclose(two, one, rtol=1e-9)
     forward = partial(height, devices=1, differentiation="forward")
@@ -142,7 +142,7 @@ def test_a_box_that_moves_within_jit_gives_what_the_whole_grid_gives(x64):
 
 
 @pytest.mark.slow
-def test_a_moving_box_holds_for_laws_still_matter_walls_devices_and_contact(x64):
+def test_a_moving_box_holds_for_laws_still_matter_walls_devices_and_contact(x64, two_devices):
     """Sand and a cube on a wide sheet of still matter, of which a box sees a part, near the wall of the domain."""
     both, axis = two_cubes(), DX / 2 * np.arange(64)
     sheet = np.stack([*(a.reshape(-1) for a in np.meshgrid(axis[:48] + 0.8, axis)), np.full(48 * 64, 0.72)], 1)

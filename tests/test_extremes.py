@@ -236,7 +236,8 @@ def test_a_scene_of_another_size_is_the_same_scene(size):
     """Scaled by a power of two, its numbers have the same digits."""
     end, same = fallen(size), fallen()
     assert np.abs(same.F - jnp.eye(3)).max() > 0.02  # it met the floor
-    atol = 0 if np.frexp(size)[0] == 0.5 else 2e-6
+    scattered_in_order = jax.default_backend() == "cpu"
+    atol = 0 if np.frexp(size)[0] == 0.5 and scattered_in_order else 2e-6
     np.testing.assert_allclose(np.asarray(end.x, np.float64) / size, same.x, rtol=0, atol=atol)
     np.testing.assert_allclose(end.v, same.v, rtol=0, atol=100 * atol)
 

@@ -114,7 +114,8 @@ def test_float32_decompositions_reach_rounding(name):
     assert (order[:, :-1] >= order[:, 1:]).all()
     assert (s[:, :2] >= 0).all()
     assert (np.diff(w, axis=-1) >= -4 * EPS * sizes(symmetric)[:, None]).all()
-    assert np.array_equal(stretch, transpose(stretch)) or np.abs(stretch - transpose(stretch)).max() < EPS * s.max()
+    # each entry is a sum of three products, and compilers differ in which of them they round
+    assert np.abs(stretch - transpose(stretch)).max() <= 3 * EPS * s.max()
 
 
 def test_last_singular_value_carries_the_sign_of_the_determinant():

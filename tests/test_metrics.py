@@ -140,7 +140,7 @@ def test_prediction_of_another_size_is_resized_by_nearest_pixel():
     rng = np.random.default_rng(0)
     small = ndimage.gaussian_filter(rng.random((23, 31)), 2) > 0.5
     truth = ndimage.gaussian_filter(rng.random((60, 50)), 4) > 0.5
-    resized = np.array(Image.fromarray(small).resize((50, 60), Image.Resampling.NEAREST))
+    resized = np.array(Image.fromarray(small.astype(np.uint8)).resize((50, 60), Image.Resampling.NEAREST)) > 0
     assert float(mean_iou(small, truth)) == float(mean_iou(resized, truth))
 
 

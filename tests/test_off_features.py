@@ -129,7 +129,7 @@ def test_a_law_reads_its_own_numbers_only(law):
 SIGNS = {
     "cubic": (lambda: traced(kernel="cubic"), lambda p: "4,4,4" in text(p)),
     "body contact": (lambda: traced(contact=BodyContact(bodies=2)), lambda p: in_steps(p)["scatter-add"] > 1),
-    "implicit steps": (lambda: traced(integrator="implicit"), lambda p: primitives(p)["while"] > 0),
+    "implicit steps": (lambda: traced(integrator="implicit"), lambda p: "while" in text(p)),
     "fibres": (lambda: traced([material("fibres")]), lambda p: primitives(p)["cos"] > 0),
     "fluid": (lambda: traced([material("fluid")]), lambda p: primitives(p)["cbrt"] > 0),
     "drucker_prager": (lambda: traced([material("drucker_prager")]), lambda p: primitives(p)["tan"] > 0),

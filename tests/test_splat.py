@@ -133,7 +133,11 @@ def test_images_equal_gsplat(gsplat_reference):
         print(f"{name} against gsplat: {psnr:.1f} dB, worst {error.max():.1e}")
         assert psnr >= 60
         assert error.max() < 5e-3
-    np.testing.assert_allclose(np.nan_to_num(frame.surface_depth), data["surface_depth"], rtol=1e-4)
+    # where the transmittance passes within rounding of tau, either splat is the surface
+    near, far = (render(gaussians, camera, GSPLAT, outputs=("surface_depth",), tau_T=0.5 + d) for d in (1e-6, -1e-6))
+    sure = np.nan_to_num(near.surface_depth) == np.nan_to_num(far.surface_depth)
+    assert sure.mean() > 0.999
+    np.testing.assert_allclose(np.nan_to_num(frame.surface_depth)[sure], data["surface_depth"][sure], rtol=1e-4)
     antialiased = render(gaussians, camera, RenderConfig(alpha_max=0.999, antialias=True)).rgb
     assert np.abs(antialiased - data["rgb_antialiased"]).max() < 5e-3
 
@@ -499,7 +503,7 @@ def test_tiles_walked_together_draw_the_same(together):
         np.testing.assert_allclose(ours, other, atol=2e-5 * np.abs(other).max())
 
 
-def test_two_devices_draw_what_one_draws():
+def test_two_devices_draw_what_one_draws(two_devices):
     scene, camera = make_scene(count=101, height=50)
     gaussians = gaussians_of(scene)
 
@@ -585,9 +589,8 @@ def test_a_chunks_running_products_and_sums_are_the_same_as_matrix_products(x64)
     alpha[:, 0], alpha[:, 1] = 0.0, 0.99
     through, gain = rng.uniform(0.2, 1, 9), rng.normal(size=(64, 9))
     _, camera = make_scene(count=1)
-    by_scan = blend_config(camera, RenderConfig(), 1, surface=False)
-    by_products = replace(by_scan, by_products=True)
-    assert not by_scan.by_products
+    usual = blend_config(camera, RenderConfig(), 1, surface=False)
+    by_scan, by_products = (replace(usual, by_products=products) for products in (False, True))
     for a, b in zip(blend_chunk(alpha, through, by_scan), blend_chunk(alpha, through, by_products), strict=True):
         np.testing.assert_allclose(b, a, rtol=1e-12)
     light = np.cumprod(np.concatenate([through[None], 1 - alpha]), axis=0)
