@@ -134,10 +134,7 @@ def box_for(
 
 def _box_around(particles, table, domain, shape, duration, gravity):
     """A box of a given size whose middle is that of where moving matter is and is heading."""
-    both = jnp.concatenate([particles.x, _after(particles.x, particles.v, duration, gravity)])
-    counts = jnp.isfinite(both) & jnp.tile(_moving(particles, table), 2)[:, None]
-    low = jnp.where(counts, both, jnp.inf).min(0)
-    high = jnp.where(counts, both, -jnp.inf).max(0)
+    low, high = _ends(particles.x, particles.v, duration, gravity, _moving(particles, table))
     middle = (jnp.where(low <= high, (low + high) / 2, domain.origin) - domain.origin) / domain.dx
     sides = np.array(domain.shape)
     first = lax.stop_gradient(jnp.clip(jnp.round(middle - (np.array(shape) - 1) / 2), 0, sides - shape))
@@ -180,9 +177,9 @@ class Fit:
         Raises:
             SimulationError: matter has spread so far that its grid would not fit into memory.
         """
-        ahead = _ways(particles, step["dt"] * step["substeps"], step["gravity"])
+        ends = _ends(particles.x, particles.v, step["dt"] * step["substeps"], step["gravity"])
         while True:
-            box = self._box(ahead, domain)
+            box = self._box(np.asarray(ends, np.float64), len(particles), domain)
             moved, path, health, met = run_frames(particles, box, table, config, devices, **step)
             low, high = np.asarray(met).T
             size, first = np.array(box.grid.shape), np.asarray(box.low)
@@ -202,17 +199,16 @@ class Fit:
         nx, ny, nz, self.slack = map(float, memory)
         self.shape = int(nx), int(ny), int(nz)
 
-    def _box(self, ahead, domain):
-        cells = (ahead - np.asarray(domain.origin, np.float64)) / float(domain.dx)
+    def _box(self, ends, count, domain):
+        if (ends[0] > ends[1]).any():  # of no particle that is finite
+            ends = np.tile(np.asarray(domain.origin, np.float64), (2, 1))
         sides = np.array(domain.shape)
-        cells = np.clip(cells[np.isfinite(cells).all(-1)], 0, sides - 1)
-        if not len(cells):
-            cells = np.zeros((1, 3))
-        low = np.floor(cells.min(0) - self.slack).astype(int) - 1
-        high = np.ceil(cells.max(0) + self.slack).astype(int) + 1
+        first, last = np.clip((ends - np.asarray(domain.origin, np.float64)) / float(domain.dx), 0, sides - 1)
+        low = np.floor(first - self.slack).astype(int) - 1
+        high = np.ceil(last + self.slack).astype(int) + 1
         needed = high - low + 1
         shape = np.array(self.shape)
-        wasteful = _nodes(shape) > max(8 * _nodes(needed), 4 * len(ahead))
+        wasteful = _nodes(shape) > max(8 * _nodes(needed), 8 * count)
         if (needed > shape).any() or wasteful:
             room = -(-(needed * _ROOM).astype(int) // _UNIT) * _UNIT
             shape = room if wasteful else np.maximum(room, shape)
@@ -235,10 +231,16 @@ def _nodes(shape):
     return math.prod(map(int, shape))
 
 
-def _ways(particles, duration, gravity):
-    """Where particles are, and where they would be after a while of free flight."""
-    x, v = (np.asarray(a, np.float64) for a in (particles.x, particles.v))
-    return np.concatenate([x, _after(x, v, float(duration), np.asarray(gravity))])
+@jax.jit
+def _ends(x, v, duration, gravity, counts=True):
+    """Lowest and highest corner [2 3] of where particles are, and would be after a while of free flight.
+
+    What is not finite is left out, and what does not count; of no particle at all the lowest corner is the higher one.
+    """
+    both = jnp.stack([x, _after(x, v, duration, gravity)])
+    known = (jnp.isfinite(both).all(-1) & counts)[..., None]
+    low, high = jnp.where(known, both, jnp.inf), jnp.where(known, both, -jnp.inf)
+    return jnp.stack([low.min((0, 1)), high.max((0, 1))])
 
 
 def _after(x, v, duration, gravity):
