@@ -27,6 +27,7 @@ from pigjax.matter import (
     Trajectory,
     bound_visual,
     group_by_law,
+    inverse,
     perfect_health,
     tile_order,
     to_chunks,
@@ -117,7 +118,7 @@ def run_frames(
             check_vma=False,  # of loops whose carries would need marks
         )
     states, paths, (health, met) = run(scene, states, start, nothing)
-    back = [jnp.argsort(order) for order in orders]
+    back = [inverse(order) for order in orders]
     states = tuple(_take(state, order) for state, order in zip(states, back))
     paths = tuple(_take(path, order, 1) for path, order in zip(paths, back))
     return grouping.particles(states, grid), grouping.path(paths, grid, frames), health, met

@@ -1,6 +1,6 @@
 """What a simulation is made of: particles and grid as users hold them, their health, and particles by law in slots."""
 
-from pigjax.matter.chunks import State, tile_order, to_chunks, to_rows
+from pigjax.matter.chunks import State, inverse, tile_order, to_chunks, to_rows
 from pigjax.matter.config import SimConfig
 from pigjax.matter.groups import Group, Grouping, bound_visual, group_by_law
 from pigjax.matter.health import Health, StepHealth, perfect_health
@@ -20,6 +20,7 @@ __all__ = [
     "bound_visual",
     "fit_grid",
     "group_by_law",
+    "inverse",
     "make_particles",
     "perfect_health",
     "tile_order",

@@ -63,13 +63,21 @@ def tile_order(cells: Float[Array, "p 3"], shape: tuple[int, int, int]) -> Int[A
     sides = [-(-n // _TILE) for n in shape]
     place = (lax.stop_gradient(cells) / _TILE).astype(jnp.int32)
     x, y, z = (jnp.clip(place[:, k], 0, side - 1) for k, side in enumerate(sides))
-    return _order((x * sides[1] + y) * sides[2] + z, math.prod(sides))
+    return order_of((x * sides[1] + y) * sides[2] + z, math.prod(sides))
 
 
-def _order(keys, most):
-    """Positions that the sorted keys had. XLA:CPU sorts one operand three times as fast as two."""
+def order_of(keys: Int[Array, "p"], most: int) -> Int[Array, "p"]:
+    """Positions that the sorted keys, all from 0 to `most` - 1, had; equal keys stay in order.
+
+    XLA:CPU sorts one operand several times as fast as two.
+    """
     count = len(keys)
     index = jnp.arange(count, dtype=jnp.uint32)
     if most * count >= 2**32:
-        return lax.sort_key_val(keys, index.astype(jnp.int32))[1]
+        return lax.sort_key_val(keys, index.astype(jnp.int32))[1]  # which is stable
     return (jnp.sort(keys.astype(jnp.uint32) * count + index) % count).astype(jnp.int32)
+
+
+def inverse(order: Int[Array, "p"]) -> Int[Array, "p"]:
+    """The permutation that undoes it; found by a sort it would take as long as a substep."""
+    return jnp.zeros_like(order).at[order].set(jnp.arange(len(order), dtype=order.dtype), unique_indices=True)

@@ -17,7 +17,7 @@ from jaxtyping import Array
 from pigjax import linalg
 from pigjax.errors import InputError
 from pigjax.materials import LAWS, MaterialTable, Parameters, respond
-from pigjax.matter.chunks import State
+from pigjax.matter.chunks import State, inverse, order_of
 from pigjax.matter.state import Grid, Particles, Trajectory
 
 
@@ -67,7 +67,7 @@ class Grouping(NamedTuple):
 
     def _merge(self, pieces, axis=0):
         merged = jnp.concatenate(pieces, axis)
-        return merged if self.order is None else jnp.take(merged, jnp.argsort(self.order), axis)
+        return merged if self.order is None else jnp.take(merged, inverse(self.order), axis)
 
 
 def group_by_law(
@@ -90,8 +90,8 @@ def group_by_law(
     laws = [law for law, size in sizes.items() if size]
     order = None
     if len(laws) > 1:
-        rank = jnp.asarray([laws.index(law) if law in laws else -1 for law in table.laws])
-        order = jnp.argsort(rank[particles.material], stable=True)
+        rank = jnp.asarray([laws.index(law) if law in laws else len(laws) for law in table.laws])
+        order = order_of(rank[particles.material], len(laws) + 1)
 
     parts = _split(particles if order is None else _reorder(particles, order), [sizes[law] for law in laws])
     moves = [LAWS[law].respond is not None for law in laws]
