@@ -7,24 +7,30 @@ from jaxtyping import install_import_hook
 
 hook = install_import_hook("pigjax", "beartype.beartype")
 os.environ.setdefault("PIGJAX_SHORT", "1")  # notebooks run in their short form
-flags = os.environ.get("XLA_FLAGS")
-# Tests compile far more than they compute: code that is not optimised takes half the processor time. Notebooks and the
-# commands that tests start are compiled as users' are, and XLA_FLAGS given from outside count more.
-quick = (
-    "--xla_cpu_parallel_codegen_split_count=1 --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
-)
-os.environ["XLA_FLAGS"] = f"{quick} {flags or ''}"
 
 import jax  # noqa: E402  (the hook must be installed before pigjax is imported)
 import pytest  # noqa: E402
 
+# Compiles in half the processor time, to code that runs slower: tests, but for the slow ones, compile far more than they
+# compute. Notebooks and commands that tests start are compiled as users' are.
+QUICK = (
+    "--xla_cpu_parallel_codegen_split_count=1 --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+)
+
 jax.config.update("jax_numpy_rank_promotion", "allow")
 jax.config.update("jax_num_cpu_devices", 2)  # for what several devices share
-jax.devices()  # reads the flags, which commands that a test starts should not see
-if flags is None:
-    del os.environ["XLA_FLAGS"]
-else:
-    os.environ["XLA_FLAGS"] = flags
+
+
+def pytest_configure(config):
+    """Start JAX: it reads the flags, and commands that a test starts do not see them. Those given from outside win."""
+    given = os.environ.get("XLA_FLAGS")
+    if config.option.markexpr == "not slow":
+        os.environ["XLA_FLAGS"] = f"{QUICK} {given or ''}"
+    jax.devices()
+    if given is None:
+        os.environ.pop("XLA_FLAGS", None)
+    else:
+        os.environ["XLA_FLAGS"] = given
 
 
 @pytest.fixture
