@@ -11,8 +11,8 @@ os.environ.setdefault("PIGJAX_SHORT", "1")  # notebooks run in their short form
 import jax  # noqa: E402  (the hook must be installed before pigjax is imported)
 import pytest  # noqa: E402
 
-# Compiles in half the processor time, to code that runs slower: tests, but for the slow ones, compile far more than they
-# compute. Notebooks and commands that tests start are compiled as users' are.
+# Compiles in half the processor time, to code that runs slower: tests, but for the slow ones, compile far more than
+# they compute. Notebooks and commands that tests start are compiled as users' are.
 QUICK = (
     "--xla_cpu_parallel_codegen_split_count=1 --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
 )
