@@ -22,7 +22,7 @@ from pigjax.study.voting import Voting, voting
 from pigjax.tune import Bounds, History, Table, fit, search, sweep
 
 Row = Mapping[str, Any]
-_SOFT_VOTES = 0.01  # temperature of a tuned vote that states none
+_SOFT_VOTES = 0.002  # temperature of a tuned vote that states none: a wider one tells no small tau_d from a larger
 
 
 def sweep_study(study: Study, out_dir: str | Path, *, progress: Callable[[int, int], Any] | None = None) -> Table:

@@ -57,9 +57,9 @@ class Voting(eqx.Module):
     def scores(self) -> dict[str, Float[Array, ""]]:
         """Loss and agreement of the objects with the held-out masks.
 
-        A Gaussian belongs to each object by its share of the votes (all to the winner where votes are hard), a pixel
-        by what is blended in it. `iou` is the mean over objects of Σ min(share, mask) / Σ max(share, mask); the loss
-        is 1 - iou.
+        A Gaussian belongs to each object by its share of the votes, or of one where it has less (all to the winner
+        where votes are hard), a pixel by what is blended in it. `iou` is the mean over objects of
+        Σ min(share, mask) / Σ max(share, mask); the loss is 1 - iou.
         """
         labels = lift_masks(
             self.gaussians,
@@ -75,7 +75,7 @@ class Voting(eqx.Module):
             member = jax.nn.one_hot(labels.object_id, self.num_ids)
         else:
             objects = labels.votes[:, 1:]
-            share = objects / (objects.sum(1, keepdims=True) + 1e-3)
+            share = objects / jnp.maximum(objects.sum(1, keepdims=True), 1.0)
             member = jnp.concatenate([jnp.zeros_like(share[:, :1]), share], 1)
 
         @jax.checkpoint
