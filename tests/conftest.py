@@ -3,13 +3,12 @@
 import os
 from pathlib import Path
 
+import jax
+import pytest
 from jaxtyping import install_import_hook
 
 hook = install_import_hook("pigjax", "beartype.beartype")
 os.environ.setdefault("PIGJAX_SHORT", "1")  # notebooks run in their short form
-
-import jax  # noqa: E402  (the hook must be installed before pigjax is imported)
-import pytest  # noqa: E402
 
 # Compiles in half the processor time, to code that runs slower: tests, but for the slow ones, compile far more than
 # they compute. Notebooks and commands that tests start are compiled as users' are.

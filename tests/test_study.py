@@ -381,3 +381,9 @@ def test_soft_votes_have_a_slope(x64):
     central = float(loss(jnp.asarray(0.01 + h)) - loss(jnp.asarray(0.01 - h))) / (2 * h)
     assert slope == pytest.approx(central, rel=1e-3)
     assert slope < -0.01  # a wider tolerance finds more of the objects
+
+
+def test_next_to_no_soft_votes_make_next_to_no_object():
+    vote = voters(jnp.asarray(0.002))
+    loss = jax.jit(lambda tau: vote.with_parameters({"segmentation.tau_d": tau}).scores()["loss"])
+    assert float(loss(1e-6)) > float(loss(0.03)) + 0.2  # a start from which descent can tell where to go

@@ -66,7 +66,7 @@ def write_json(path: PathLike, content: Any) -> None:
     """
     try:
         encoded = msgspec.json.encode(content, enc_hook=_plain)
-    except (TypeError, NotImplementedError) as error:
+    except TypeError as error:
         raise InputError(
             f"{path}: content has no JSON form ({error}); give plain numbers, strings or arrays."
         ) from None
@@ -103,5 +103,4 @@ def _plain(value: Any) -> Any:
         return os.fspath(value)
     if hasattr(value, "__array__"):
         return np.asarray(value).tolist()
-    # msgspec asks its hooks to say so of what they do not know; `write_json` makes an InputError of it
-    raise NotImplementedError(f"{type(value).__name__} {value!r}")
+    raise TypeError(f"{type(value).__name__} {value!r}")
