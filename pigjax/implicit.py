@@ -1,13 +1,15 @@
 """Backward Euler on the grid: the velocities that the stresses at the end of the step balance, by Newton's method.
 
-Each Newton step is a Krylov solve with Hessian-vector products, so that no matrix is ever built (Gast et al. 2015, doi
-10.1109/TVCG.2015.2459687). What colliders, walls and stationary matter leave free is decided anew at each of them, so
-that matter lets go where it would be pulled; friction acts on the result. Derivatives go by the implicit function
-theorem.
+Each Newton step is a Krylov solve with the derivatives of the forces (Gast et al. 2015, doi 10.1109/TVCG.2015.2459687).
+What is in the way of matter holds it softly, as stiff as the matter is itself: that is a convex problem, where hard
+contact would make Newton's method jump between sets of touched nodes. What presses is then known, and friction is found
+with it in a second solve (lagged, as by Li et al. 2020, doi 10.1145/3386569.3392425), so that stiff matter shares its
+impulse within the step. Derivatives go by the implicit function theorem.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,23 +17,31 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.scipy.sparse.linalg import bicgstab, cg
 from jaxtyping import Array, Bool, Float
 
 from pigjax.arrays import everywhere
-from pigjax.materials import LAWS, respond
-from pigjax.materials.tensors import cofactors, determinant, identity, product
-from pigjax.matter.groups import by_component
-from pigjax.substep import Scene, Setting, boundaries, free_velocity, parameters_of
-from pigjax.transfers import add_windows, distances, first_nodes, from_windows, stage, take_windows, to_windows
+from pigjax.colliders import Press
+from pigjax.krylov import (
+    Modes,
+    Nodes,
+    Preconditioner,
+    conjugate_gradients,
+    in_modes,
+    precondition,
+    stabilized_gradients,
+)
+from pigjax.materials import LAWS
+from pigjax.substep import Scene, Setting, boundaries, free_velocity
+from pigjax.tangents import forces, masses, stiffness, tangents
 
-_HALVINGS = 6  # of a Newton step that makes things worse
-_GROWTH = 4.0  # of the residual that a Newton step may bring
-_PATIENCE = 3  # Newton steps without gain
+_CONTACT = 1.0  # stiffness of what is in the way, relative to the diagonal of the matter's
+_INERTIA = 100.0  # what is in the way holds light matter as if it weighed so many times what it does
+_LENGTHS = 6  # of a Newton step that are tried
+_PATIENCE = 4  # Newton steps without gain
 _FORCING = 0.05  # residual of the Krylov solve of a Newton step, relative to its right-hand side
 _EXACT = 1e-8  # the same where derivatives are wanted
 
-Nodes = Float[Array, "x y z 3"]
+Limit = Callable[[Nodes], Nodes]  # velocities that what is in the way leaves of others
 
 
 def balanced_velocity(
@@ -47,163 +57,178 @@ def balanced_velocity(
         time: of the step's beginning [s].
     """
     filled, guess = free_velocity(scene, nodes)
-    mass = jnp.where(filled, nodes[..., :1], scene.unit_mass)
+    mass, stiff = jnp.where(filled, nodes[..., :1], scene.unit_mass), stiffness(setting, scene, states)
+    step = _Step(setting, scene, states, filled, guess, mass, stiff)
+    modes = lax.stop_gradient(_modes(step))
+    coarse = lax.stop_gradient(in_modes(_unhindered(step, guess), modes))
     smooth = scene._replace(colliders=tuple(map(_without_friction, scene.colliders)))
     limit = partial(boundaries, setting, smooth, time=time)
-    stiffness = lax.stop_gradient(_stiffness(setting, scene, states))
-    scale = lax.stop_gradient(mass) + stiffness
-    krylov = cg if all(LAWS[law].total for law in setting.laws) else bicgstab
+    v, found = _balance(step, modes, coarse, limit, guess, limit)
+    if any(collider.mode == "separate" for collider in scene.colliders):
+        limit = partial(boundaries, setting, scene, time=time)
+        speeds = _pressing(smooth, v, time)
+        exact, secant = (partial(limit, press=[Press(s, secant=k) for s in speeds]) for k in (False, True))
+        v, found_too = _balance(step, modes, coarse, exact, v, secant)
+        found &= found_too
+    return boundaries(setting, scene, v, time=time), found
 
-    def force(v):
-        return jnp.where(filled, _forces(setting, scene, states, v), 0)
 
-    def pushed(v):
-        """Velocities that the stresses at the end of the step lead to, with nothing in the way."""
-        return guess + scene.dt / mass * force(v)
+class _Step(NamedTuple):
+    """What does not change while the velocities of a step are looked for."""
 
-    def led(v):
-        """Velocities after a step down the imbalance of momentum, short enough for the stiffness."""
-        return v + mass / scale * (pushed(v) - v)
+    setting: Setting
+    scene: Scene
+    states: tuple[Any, ...]
+    filled: Bool[Array, "x y z 1"]  # nodes with mass
+    guess: Nodes  # velocities without stress and with nothing in the way
+    mass: Float[Array, "x y z 1"]
+    stiff: Float[Array, "x y z 1"]  # diagonal of dt² times the stiffness [kg]
+
+    @property
+    def scale(self) -> Float[Array, "x y z 1"]:
+        """Diagonal of the matter's operator [kg]."""
+        return lax.stop_gradient(self.mass + self.stiff)
+
+    @property
+    def hold(self) -> Float[Array, "x y z 1"]:
+        """The same of what is in the way."""
+        return _INERTIA * self.mass + _CONTACT * self.stiff
+
+
+def _balance(
+    step: _Step, modes: Modes, coarse: Float[Array, "n n"], limit: Limit, start: Nodes, secant: Limit
+) -> tuple[Nodes, Bool[Array, ""]]:
+    """Velocities that balance where what is in the way pushes by how much `limit` changes them; were they found?
+
+    Newton's method takes the derivative of `secant`, which must not be less.
+    """
 
     def residual(v):
-        """Momentum [kg m/s] by which v misses its balance, within what is allowed."""
-        return scale * (v - limit(led(v)))
-
-    def size(momentum):
-        return jnp.sqrt((momentum**2 / scale).sum())
-
-    def solve(apply, right, tolerance, method):
-        return method(apply, right, tol=tolerance, maxiter=setting.krylov_steps, M=lambda r: r / scale)[0]
-
-    def direction(v, r):
-        """Newton's, with what is in the way now: fixed where it is, and a symmetric problem in what it leaves free."""
-        _, free = jax.linearize(limit, led(v))
-        _, change_of_force = jax.linearize(force, v)
-        fixed = (free(r) - r) / scale
-        right = free(scene.dt * change_of_force(fixed) - r)
-
-        def apply(d):
-            inside = free(d)
-            return free(mass * inside - scene.dt * change_of_force(inside)) + mass * (d - inside)
-
-        return fixed + free(solve(apply, right, _FORCING, krylov))
-
-    def newton(function, start):
-        drive = size(scene.dt * force(start)) + size(mass * (guess - start)) + size(scene.dt * mass * scene.gravity)
-        rounding = jnp.finfo(start.dtype).eps * scene.grid.dx / scene.dt
-        enough = setting.newton_tolerance * drive + size(jnp.broadcast_to(rounding * stiffness, start.shape))
-
-        def unfinished(carry):
-            step, _, _, best, last = carry
-            return ~everywhere((best.size <= enough) | (step >= setting.newton_steps) | (step - last > _PATIENCE))
-
-        def improve(carry):
-            step, v, r, best, last = carry
-            v, r = _backtrack(function, size, v, r, direction(v, r))
-            found = _Best(v, size(r))
-            better = found.size < best.size
-            best = jax.tree.map(lambda new, old: jnp.where(better, new, old), found, best)
-            return step + 1, v, r, best, jnp.where(better, step + 1, last)
-
-        r, none = function(start), jnp.zeros((), int)
-        best = lax.while_loop(unfinished, improve, (none, start, r, _Best(start, size(r)), none))[3]
-        return best.v, (best.size <= enough).astype(start.dtype)  # a float: custom_root wants a tangent of it
+        """Momentum [kg m/s] by which v misses its balance."""
+        stress = step.scene.dt * jnp.where(step.filled, forces(step.setting, step.scene, step.states, v), 0)
+        return step.mass * (v - step.guess) - stress + step.hold * (v - limit(v))
 
     def tangent_solve(apply, right):
-        exact = partial(solve, tolerance=_EXACT, method=bicgstab)
+        about = precondition(lambda r: r / step.scale, modes, coarse)
+        exact = partial(stabilized_gradients, precondition=about, tolerance=_EXACT, steps=step.setting.krylov_steps)
         return lax.custom_linear_solve(apply, right, exact, transpose_solve=exact)
 
-    v, converged = lax.custom_root(residual, limit(guess), newton, tangent_solve, has_aux=True)
-    # what is in the way meets the impulse that v would not bear; in free directions its rounding is not let in
-    way = pushed(v)
-    _, free = jax.linearize(limit, way)
-    return boundaries(setting, scene, v + (way - v) - free(way - v), time=time), lax.stop_gradient(converged) > 0
+    newton = partial(_newton, step, modes, coarse, secant)
+    v, found = lax.custom_root(residual, start, newton, tangent_solve, has_aux=True)
+    return v, lax.stop_gradient(found) > 0
 
 
 class _Best(NamedTuple):
     v: Nodes
-    size: Float[Array, ""]  # of the residual
+    r: Nodes  # residual
+    balanced: Bool[Array, ""]  # whether it is within the tolerance
 
 
-def _backtrack(function, size, start, r, direction):
-    """The longest of halved steps that does not make the residual r much larger, or none.
+def _newton(step, modes, coarse, limit, residual, start):
+    """The velocities nearest to balance that were met, and 1 if they are within the tolerance."""
+    setting, scene = step.setting, step.scene
+    rounding = jnp.finfo(start.dtype).eps * scene.grid.dx / scene.dt * step.stiff
+    noise = jnp.sqrt((rounding**2 / step.scale).sum()) / 16
 
-    Some growth is let pass: which nodes touch a collider changes on the way to the balance.
-    """
-    most = _GROWTH * size(r)
+    def unfinished(carry):
+        count, _, _, best, last = carry
+        return ~everywhere(best.balanced | (count >= setting.newton_steps) | (count - last > _PATIENCE))
+
+    def improve(carry):
+        count, v, r, best, last = carry
+        d, about = _direction(step, modes, coarse, limit, v, r)
+        v, r = _line_search(residual, v, r, d)
+        # against the impulses that balance here: by the preconditioner, which knows how soft the whole is
+        drive = about.size(step.mass * (v - step.guess)) + about.size(scene.dt * step.mass * scene.gravity)
+        found = _Best(v, r, about.size(r) <= setting.newton_tolerance * drive + noise)
+        better = about.size(r) < about.size(best.r)
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), found, best)
+        return count + 1, v, r, best, jnp.where(better, count + 1, last)
+
+    r, none = residual(start), jnp.zeros((), int)
+    carry = (none, start, r, _Best(start, r, jnp.asarray(False)), none)
+    best = lax.while_loop(unfinished, improve, carry)[3]
+    return best.v, best.balanced.astype(start.dtype)  # a float: custom_root wants a tangent of it
+
+
+def _unhindered(step, v):
+    """What momentum [kg m/s] a change of velocities takes, around v and with nothing in the way."""
+    change_of_force = tangents(step.setting, step.scene, step.states, v)
+    return lambda d: step.mass * d - step.scene.dt * jnp.where(step.filled, change_of_force(d), 0)
+
+
+def _direction(step, modes, coarse, limit, v, r) -> tuple[Nodes, Preconditioner]:
+    """Newton's, and the preconditioner that found it."""
+    alone = _unhindered(step, v)
+    _, free = jax.linearize(limit, v)
+
+    def held(d):
+        return step.hold * (d - free(d))
+
+    def diagonal(r):
+        inside = free(r)
+        return inside / step.scale + (r - inside) / (step.scale + step.hold)
+
+    symmetric = all(LAWS[law].total for law in step.setting.laws)
+    solve = conjugate_gradients if symmetric else stabilized_gradients
+    about = precondition(diagonal, modes, coarse + in_modes(held, modes))
+    steps = step.setting.krylov_steps
+    return solve(lambda d: alone(d) + held(d), -r, precondition=about, tolerance=_FORCING, steps=steps), about
+
+
+def _line_search(residual, start, r, direction):
+    """Velocities along the direction where the imbalance along it is at most half of what it was, and the residual."""
+    slope = (r * direction).sum()
 
     def too_far(carry):
-        halvings, _, r = carry
-        return ~everywhere((size(r) < most) | (halvings >= _HALVINGS))
+        count, _, _, _, _, after = carry
+        return ~everywhere((jnp.abs(after) <= 0.5 * jnp.abs(slope)) | (count >= _LENGTHS))
 
-    def halve(carry):
-        halvings, _, _ = carry
-        v = start + direction * 0.5 ** (halvings + 1.0)
-        return halvings + 1, v, function(v)
+    def between(carry):
+        """By the secant, between a length that is too short and one that is too long."""
+        count, low, high, length, _, after = carry
+        short = after * slope > 0
+        low, high = (
+            jax.tree.map(lambda new, old, here=here: jnp.where(here, new, old), (length, after), end)
+            for here, end in ((short, low), (~short, high))
+        )
+        share = low[1] / jnp.where(low[1] == high[1], 1.0, low[1] - high[1])
+        length = low[0] + (high[0] - low[0]) * jnp.clip(share, 0.1, 0.9)
+        r = residual(start + length * direction)
+        return count + 1, low, high, length, r, (r * direction).sum()
 
-    v = start + direction
-    _, v, new = lax.while_loop(too_far, halve, (jnp.zeros((), int), v, function(v)))
-    fine = size(new) < most
-    return jnp.where(fine, v, start), jnp.where(fine, new, r)
-
-
-def _forces(setting, scene, states, v):
-    """Forces of the stresses [N] that matter has after a step with these velocities of the nodes."""
-    total: Array | float = 0.0
-    for law, parameters, state in zip(setting.laws, scene.parameters, states):
-        visit = partial(_chunk_forces, setting, scene, law, parameters, v)
-        total = total + lax.fori_loop(0, len(state.cells), _adding(visit, state), jnp.zeros((*v.shape[:3], 4), v.dtype))
-    total = jnp.asarray(total)[..., 1:]
-    return total if setting.axis is None else lax.psum(total, setting.axis)
-
-
-def _adding(visit, state):
-    def body(i, grid):
-        first, windows = jax.checkpoint(visit)(jax.tree.map(lambda rows: rows[i], state))
-        return add_windows(grid, first, windows)
-
-    return body
+    one, new = jnp.ones_like(slope), residual(start + direction)
+    after = (new * direction).sum()
+    carry = (jnp.zeros((), int), (0 * one, slope), (one, after), one, new, after)
+    _, _, _, length, r, _ = lax.while_loop(too_far, between, carry)
+    return start + length * direction, r
 
 
-def _chunk_forces(setting, scene, law, parameters, v, state):
-    """First nodes and windows of one chunk."""
-    kernel, shape, go, dx = setting.kernel, scene.grid.shape, scene.go, scene.grid.dx
-    first = stage(go, lambda cells: first_nodes(cells, kernel, shape), state.cells)
-    distance = stage(go, lambda cells: distances(cells, kernel, shape), state.cells)
-    _, per_cell = from_windows(kernel, go, distance, take_windows(v, first, kernel))
-
-    def affine(state, per_cell):
-        rate = per_cell / dx
-        own = parameters if state.row is None else parameters_of(parameters, state.row[0])
-        hardening = None if state.hardening is None else state.hardening[0]
-        stress = respond(law, by_component(state.F), rate, scene.dt, hardening, own).stress
-        # τ (I + dt ∇v)⁻ᵀ is P Fᵀ with F of the step's beginning: the derivative of the energy by the nodes' ways
-        way = identity(rate) + scene.dt * rate
-        pulled = product(stress, cofactors(way)) / determinant(way)
-        return (-kernel.inverse_inertia / dx) * state.volume * pulled
-
-    none = jnp.zeros_like(state.volume[0])
-    return first, to_windows(kernel, go, distance, none, jnp.zeros_like(state.v), stage(go, affine, state, per_cell))
+def _modes(step) -> Modes:
+    """Ways in which each material moves as a whole: its share of the nodes, and that times their place."""
+    share = jnp.moveaxis(masses(step.setting, step.scene, step.states), -1, 0)
+    mass, filled = share.sum(0), step.filled[..., 0]
+    share = jnp.where(filled, share / jnp.where(filled, mass, 1.0), 0.0)
+    axes = [jnp.arange(n, dtype=share.dtype) for n in step.scene.grid.shape]
+    nodes = jnp.stack(jnp.meshgrid(*axes, indexing="ij"))
+    ways = []
+    for own in share:
+        weight = own * mass / jnp.maximum((own * mass).sum(), jnp.finfo(mass.dtype).tiny)
+        from_middle = nodes - (weight * nodes).sum((1, 2, 3), keepdims=True)
+        spread = jnp.sqrt((weight * from_middle**2).sum((1, 2, 3), keepdims=True))
+        ways += [own[None], own * from_middle / jnp.where(spread > 0, spread, 1.0)]
+    return jnp.concatenate(ways)
 
 
-def _stiffness(setting, scene, states):
-    """A diagonal like that of dt² times the stiffness [kg], to precondition with."""
-    kernel, shape, go = setting.kernel, scene.grid.shape, scene.go
-    total: Array | float = 0.0
-    for law, parameters, state in zip(setting.laws, scene.parameters, states):
-
-        def visit(state, law=law, parameters=parameters):
-            own = parameters if state.row is None else parameters_of(parameters, state.row[0])
-            spring = kernel.inverse_inertia * state.volume[0] * LAWS[law].modulus(own)
-            still, none = jnp.zeros_like(state.v), jnp.zeros((3, *state.v.shape), state.v.dtype)
-            distance = distances(state.cells, kernel, shape)
-            windows = to_windows(kernel, go, distance, (scene.dt / scene.grid.dx) ** 2 * spring, still, none)
-            return first_nodes(state.cells, kernel, shape), windows
-
-        nothing = jnp.zeros((*shape, 4), scene.dt.dtype)
-        total = total + lax.fori_loop(0, len(state.cells), _adding(visit, state), nothing)
-    total = jnp.asarray(total)[..., :1]
-    return total if setting.axis is None else lax.psum(total, setting.axis)
+def _pressing(smooth, v, time):
+    """Speeds [m/s] at which nodes press against each collider, one after another."""
+    found = []
+    for collider, contact in zip(smooth.colliders, smooth.contacts):
+        contact = collider.contact(smooth.grid.points, time) if contact is None else contact
+        held = collider.apply(contact, v)
+        found.append(((held - v) * contact.normal).sum(-1, keepdims=True))
+        v = held
+    return found
 
 
 def _without_friction(collider):

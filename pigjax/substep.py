@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from pigjax.colliders import Collider, Contact
+from pigjax.colliders import Collider, Contact, Press
 from pigjax.contact import BodyContact
 from pigjax.materials import Parameters, respond
 from pigjax.materials.tensors import determinant, product
@@ -299,12 +299,20 @@ def _part_bodies(setting, scene, states, nodes, velocity):
 
 
 def boundaries(
-    setting: Setting, scene: Scene, velocity: Float[Array, "*b x y z 3"], *, time: Array
+    setting: Setting,
+    scene: Scene,
+    velocity: Float[Array, "*b x y z 3"],
+    *,
+    time: Array,
+    press: Sequence[Press] | None = None,
 ) -> Float[Array, "n y z 3"]:
-    """Velocities of the nodes after colliders, stationary matter and the walls of the domain."""
-    for collider, contact in zip(scene.colliders, scene.contacts):
+    """Velocities of the nodes after colliders, stationary matter and the walls of the domain.
+
+    With `press`, friction goes by how nodes are said to press against each collider.
+    """
+    for k, (collider, contact) in enumerate(zip(scene.colliders, scene.contacts)):
         contact = collider.contact(scene.grid.points, time) if contact is None else contact
-        velocity = collider.apply(contact, velocity)
+        velocity = collider.apply(contact, velocity, None if press is None else press[k])
     if scene.frozen is not None:
         velocity = jnp.where(scene.frozen[..., None], 0.0, velocity)
     return _apply_walls(velocity, setting.walls, scene).reshape(*scene.nodes, 3)

@@ -65,6 +65,22 @@ def test_a_stiff_block_lands_in_frame_sized_steps_and_lets_go(x64):
     assert float(away.v[:, 2].mean()) == pytest.approx(float(lifted.v[:, 2].mean()) - 0.08 * 9.8, abs=0.05)
 
 
+def test_a_block_as_stiff_as_steel_slides_like_a_rigid_one_in_frame_sized_steps():
+    """E = 1e11 in float32: explicit steps would be 4,000 times as many."""
+    particles, table = block(young=1e11, height=5.0, velocity=(1.0, 0.0, 0.0))
+    steps = {"frames": 8, "frame_dt": 1 / 80, "colliders": (FLOOR,)}
+    end, path, health = run(particles, table, 1, integrator="implicit", **steps)
+    assert int(health.unconverged) == 0
+    braking, times = FLOOR.friction * 9.8, np.arange(1, 9) / 80
+    speed, way = path.v[..., 0].mean(1), (path.x - particles.x)[..., 0].mean(1)
+    print("slower than the closed form by", (1 - braking * times - speed) / braking / times, "of the braking")
+    np.testing.assert_allclose(1 - speed, braking * times, rtol=0.02)
+    # backward Euler moves by the speed at the end of a step
+    np.testing.assert_allclose(way, times - braking * times * (times + 1 / 80) / 2, rtol=1e-3)
+    np.testing.assert_allclose(end.x[:, 2], particles.x[:, 2], atol=0.01 * DX)
+    np.testing.assert_allclose(end.F, particles.F, atol=0.01)
+
+
 @pytest.mark.slow
 def test_derivatives_go_through_implicit_steps(x64):
     """By the implicit function theorem, against central differences."""
@@ -88,7 +104,6 @@ def test_derivatives_go_through_implicit_steps(x64):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_steps_that_do_not_converge_are_counted():
     particles, table = block(young=1e7, height=5.3)
     _, _, health = run(particles, table, 1, frames=8, colliders=(FLOOR,), integrator="implicit", newton_steps=1)
@@ -98,7 +113,7 @@ def test_steps_that_do_not_converge_are_counted():
 
 def test_auto_takes_implicit_steps_only_where_they_pay():
     steps = {"frames": 1, "frame_dt": 0.1, "gravity": (0.0, 0.0, 0.0)}
-    for young, expected in ((1e5, "explicit"), (1e13, "implicit")):
+    for young, expected in ((1e5, "explicit"), (1e10, "implicit")):
         particles, table = block(young, velocity=(0.0, 0.0, 0.0))
         assert choose_integrator(particles, DOMAIN, table, SimConfig(integrator="auto"), **steps).integrator == expected
     with pytest.raises(InputError, match="cannot choose its integrator"):

@@ -3,8 +3,8 @@
 To add one: subclass `Collider` and write its `shape_distance` and `ball`; normals follow by differentiation.
 """
 
-from pigjax.colliders.base import MODES, Collider, Contact
+from pigjax.colliders.base import MODES, Collider, Contact, Press
 from pigjax.colliders.sampled import SampledDistance
 from pigjax.colliders.shapes import Box, Capsule, Cylinder, Plane, Sphere
 
-__all__ = ["MODES", "Box", "Capsule", "Collider", "Contact", "Cylinder", "Plane", "SampledDistance", "Sphere"]
+__all__ = ["MODES", "Box", "Capsule", "Collider", "Contact", "Cylinder", "Plane", "Press", "SampledDistance", "Sphere"]

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from pigjax.arrays import as_array, static_field
@@ -39,6 +40,13 @@ class Contact(NamedTuple):
     inside: Bool[Array, "*n"] | Float[Array, "*n"]  # or the share of a soft contact
     normal: Float[Array, "*n 3"]
     velocity: Float[Array, "*#n 3"] | None = None  # of the collider's matter at the points [m/s]; None: at rest
+
+
+class Press(NamedTuple):
+    """How nodes press against a collider, where that is known beforehand."""
+
+    speed: Float[Array, "*n 1"]  # [m/s]: friction takes at most its coefficient times this from what glides
+    secant: bool = False  # whether friction has the derivative of a drag of the strength that it happens to have
 
 
 class Collider(eqx.Module):
@@ -132,16 +140,16 @@ class Collider(eqx.Module):
         longest = [safe_norm(points - self._pivot_at(time)).max() for time in (0.0, duration)]
         return speed + safe_norm(self.angular_velocity) * jnp.minimum(reach, jnp.maximum(*longest))
 
-    def apply(self, contact: Contact, velocity: Points) -> Points:
-        """Velocities of grid nodes [m/s] after they met the collider."""
+    def apply(self, contact: Contact, velocity: Points, press: Press | None = None) -> Points:
+        """Velocities of grid nodes [m/s] after they met it, with friction by how they did so or as `press` says."""
         own = 0.0 if contact.velocity is None else contact.velocity
-        touched = own + self._allowed(velocity - own, contact.normal)
+        touched = own + self._allowed(velocity - own, contact.normal, press)
         inside = contact.inside[..., None]
         if self.softness is None:
             return jnp.where(inside, touched, velocity)
         return velocity + inside * (touched - velocity)
 
-    def _allowed(self, relative, normal):
+    def _allowed(self, relative, normal, press):
         if self.mode == "sticky":
             return jnp.zeros_like(relative)
         speed = (relative * normal).sum(-1, keepdims=True)
@@ -149,6 +157,11 @@ class Collider(eqx.Module):
         if self.mode == "slip":
             return tangential
         glide = safe_norm(tangential)[..., None]
+        if press is not None:
+            bound = self.friction * press.speed
+            drag = jnp.where(glide > bound, bound / jnp.where(glide > bound, glide, 1.0), press.speed > 0)
+            drag = lax.stop_gradient(drag) if press.secant else drag
+            return (1 - drag) * tangential + jnp.maximum(speed, 0.0) * normal
         # Coulomb: the tangential impulse is at most the friction coefficient times the normal one, which is -speed.
         # What is too slow to glide is not divided by: the slope at next to no glide would be infinite times nothing.
         glides = (speed < 0) & (glide >= -self.friction * speed)

@@ -1,0 +1,158 @@
+"""Forces of the stresses that matter has after a step with given velocities of the nodes, and their derivatives."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from pigjax.materials import LAWS, respond
+from pigjax.materials.tensors import cofactors, determinant, identity, product
+from pigjax.matter.groups import by_component
+from pigjax.substep import Scene, Setting, parameters_of
+from pigjax.transfers import add_windows, distances, first_nodes, from_windows, stage, take_windows, to_windows
+
+Nodes = Float[Array, "x y z 3"]
+
+
+def forces(setting: Setting, scene: Scene, states: tuple[Any, ...], v: Nodes) -> Nodes:
+    """Forces [N] of the stresses after a step with velocities v [m/s] of the nodes."""
+
+    def visit(law, parameters, state):
+        """First nodes and windows of one chunk."""
+        first, distance = _places(setting, scene, state)
+        _, per_cell = from_windows(setting.kernel, scene.go, distance, take_windows(v, first, setting.kernel))
+        pulled = stage(scene.go, partial(_pulled, setting, scene, law, parameters), state, per_cell)
+        return first, _spread(setting, scene, distance, state, pulled)
+
+    return _over_chunks(setting, scene, states, visit)[..., 1:]
+
+
+class Tangents(NamedTuple):
+    """Derivatives of the forces of each particle by the gradient of velocity around it, law by law in chunks."""
+
+    setting: Setting
+    scene: Scene
+    states: tuple[Any, ...]
+    slopes: tuple[Float[Array, "n 9 9 c"], ...]  # by the first 9
+
+    def __call__(self, change: Nodes) -> Nodes:
+        """Change of the forces [N] with a change of velocities [m/s]: a transfer there and back, and no law."""
+        setting, scene = self.setting, self.scene
+
+        def visit(law, parameters, state_and_slope):
+            state, slope = state_and_slope
+            first, distance = _places(setting, scene, state)
+            _, per_cell = from_windows(setting.kernel, scene.go, distance, take_windows(change, first, setting.kernel))
+
+            def pulled(slope, per_cell):
+                return sum(row * rate for row, rate in zip(slope, per_cell.reshape(9, 1, -1))).reshape(3, 3, -1)
+
+            return first, _spread(setting, scene, distance, state, stage(scene.go, pulled, slope, per_cell))
+
+        return _over_chunks(setting, scene, tuple(zip(self.states, self.slopes)), visit)[..., 1:]
+
+
+def tangents(setting: Setting, scene: Scene, states: tuple[Any, ...], v: Nodes) -> Tangents:
+    """Derivatives of `forces` at v, kept as 81 numbers a particle: a Krylov solve then meets no law."""
+
+    def of_law(law, parameters, state):
+        def of_chunk(state):
+            first, distance = _places(setting, scene, state)
+            _, per_cell = from_windows(setting.kernel, scene.go, distance, take_windows(v, first, setting.kernel))
+            function = partial(_pulled, setting, scene, law, parameters, state)
+            units = jnp.eye(9, dtype=v.dtype).reshape(9, 3, 3, 1)
+
+            def along(unit):
+                return jax.jvp(function, (per_cell,), (jnp.broadcast_to(unit, per_cell.shape),))[1].reshape(9, -1)
+
+            return stage(scene.go, lambda units: lax.map(along, units), units)
+
+        return lax.map(of_chunk, state)
+
+    slopes = tuple(of_law(*group) for group in zip(setting.laws, scene.parameters, states))
+    return Tangents(setting, scene, states, slopes)
+
+
+def stiffness(setting: Setting, scene: Scene, states: tuple[Any, ...]) -> Float[Array, "x y z 1"]:
+    """Diagonal of dt² times the stiffness [kg], were all of it that of pressure waves at rest."""
+    kernel = setting.kernel
+
+    def visit(law, parameters, state):
+        own = parameters if state.row is None else parameters_of(parameters, state.row[0])
+        first, distance = _places(setting, scene, state)
+        spring = state.volume[0] * LAWS[law].modulus(own) * (kernel.inverse_inertia * scene.dt / scene.grid.dx) ** 2
+        return first, stage(scene.go, partial(_squares, kernel), distance, spring)[:, :, :, None]
+
+    return _over_chunks(setting, scene, states, visit, channels=1)
+
+
+def _squares(kernel, distance, factor):
+    """Squares of what each node of a window [n n n c] has to do with the gradient of velocity: Σ (wᵢ oᵢ)²."""
+    weights = jnp.stack(kernel.weights(distance)) ** 2
+    offsets = (jnp.asarray(kernel.offsets, distance.dtype)[:, None, None] - distance) ** 2
+    (wx, wy, wz), (x, y, z) = jnp.moveaxis(weights, 1, 0), jnp.moveaxis(offsets, 1, 0)
+    lengths = x[:, None, None] + y[None, :, None] + z[None, None, :]
+    return factor * wx[:, None, None] * wy[None, :, None] * wz[None, None, :] * lengths
+
+
+def masses(setting: Setting, scene: Scene, states: tuple[Any, ...]) -> Float[Array, "x y z b"]:
+    """Mass of the nodes [kg] that each material brings; materials are those of the table that move, law by law."""
+    found = []
+    for group, parameters in enumerate(scene.parameters):
+        rows = len(jnp.atleast_1d(parameters.density))
+        for row in range(rows):
+
+            def visit(law, parameters, state, row=row):
+                first, distance = _places(setting, scene, state)
+                own = state.mass[0] if state.row is None else jnp.where(state.row[0] == row, state.mass[0], 0)
+                return first, _spread(setting, scene, distance, state, 0.0, mass=own)
+
+            own = Setting(**setting._asdict() | {"laws": setting.laws[group : group + 1]})
+            part = scene._replace(parameters=(parameters,))
+            found.append(_over_chunks(own, part, states[group : group + 1], visit)[..., :1])
+    return jnp.concatenate(found, -1)
+
+
+def _pulled(setting, scene, law, parameters, state, per_cell):
+    """What spreads the stress after a step with this gradient of velocity [m/s per cell] over the nodes."""
+    rate = per_cell / scene.grid.dx
+    own = parameters if state.row is None else parameters_of(parameters, state.row[0])
+    hardening = None if state.hardening is None else state.hardening[0]
+    stress = respond(law, by_component(state.F), rate, scene.dt, hardening, own).stress
+    # τ (I + dt ∇v)⁻ᵀ is P Fᵀ with F of the step's beginning: the derivative of the energy by the nodes' ways
+    way = identity(rate) + scene.dt * rate
+    pulled = product(stress, cofactors(way)) / determinant(way)
+    return (-setting.kernel.inverse_inertia / scene.grid.dx) * state.volume * pulled
+
+
+def _places(setting, scene, state):
+    """First nodes of the windows of a chunk, and the distances to their nodes in the middle."""
+    kernel, shape, go = setting.kernel, scene.grid.shape, scene.go
+    first = stage(go, lambda cells: first_nodes(cells, kernel, shape), state.cells)
+    return first, stage(go, lambda cells: distances(cells, kernel, shape), state.cells)
+
+
+def _spread(setting, scene, distance, state, affine, mass=None):
+    """Windows of a chunk [n n n 4 c]: `mass`, and forces that grow linearly."""
+    mass = jnp.zeros_like(state.volume[0]) if mass is None else mass
+    affine = jnp.broadcast_to(affine, (3, *state.v.shape))
+    return to_windows(setting.kernel, scene.go, distance, mass, jnp.zeros_like(state.v), affine)
+
+
+def _over_chunks(setting, scene, states, visit, channels=4):
+    """Grid [nx ny nz k] with the windows of all chunks added up; chunks are computed anew in reverse mode."""
+    nothing = jnp.zeros((*scene.grid.shape, channels), scene.dt.dtype)
+    total = nothing
+    for law, parameters, state in zip(setting.laws, scene.parameters, states):
+
+        def body(i, grid, law=law, parameters=parameters, state=state):
+            chunk = jax.tree.map(lambda rows: rows[i], state)
+            return add_windows(grid, *jax.checkpoint(partial(visit, law, parameters))(chunk))
+
+        total = total + lax.fori_loop(0, len(jax.tree.leaves(state)[0]), body, nothing)
+    return total if setting.axis is None else lax.psum(total, setting.axis)
