@@ -154,10 +154,13 @@ def _on_grid(setting, scene, states, nodes, time):
     """Velocities of the nodes after the step, and whether they were found."""
     if setting.balance is not None:
         return setting.balance(setting, scene, states, nodes, time)
-    _, velocity = free_velocity(scene, nodes)
+    limit = partial(boundaries, setting, scene, time=time)
     if scene.contact is not None:
-        velocity = _part_bodies(setting, scene, states, nodes, velocity)
-    return boundaries(setting, scene, velocity, time=time), True
+        _, velocity = free_velocity(scene, nodes)
+        return limit(_part_bodies(setting, scene, states, nodes, velocity)), True
+    # computed anew in reverse mode, which would keep six grids of each step in between
+    velocities = jax.checkpoint(lambda nodes: limit(free_velocity(scene, nodes)[1]), prevent_cse=False)
+    return velocities(nodes), True
 
 
 def _to_grid(setting, scene, states):

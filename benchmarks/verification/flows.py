@@ -159,12 +159,13 @@ def sand_cylinder():
     """A cylinder of the same sand, a quarter of it between smooth walls.
 
     Lube et al. (2004, doi 10.1017/S0022112004009036): 1.24 a or 1.6 √a. It spreads thinner than the columns in plane
-    strain, and three dimensions afford fewer cells: it falls short by more, and gains as cells shrink. The last row
-    takes the run-out as linear in the size of a cell and draws it to zero: an estimate, not a simulation.
+    strain, and falls short by more until cells are as small as theirs: 24 to the radius. The last row takes the run-out
+    as linear in the size of a cell and draws it to zero: an estimate, not a simulation.
     """
-    case = _columns("sand cylinder", ((1.0, 10), (1.0, 15)), axisymmetric=True)
-    coarse, fine = (float(row.ours) for row in case.rows)
-    limit, expected = fine + (fine - coarse) * 10 / (15 - 10), lube(1.0, True)
+    studies = (12, 24)
+    case = _columns("sand cylinder", [(1.0, cells) for cells in studies], axisymmetric=True)
+    (coarse, fine), expected = (float(row.ours) for row in case.rows), lube(1.0, True)
+    limit = fine + (fine - coarse) * studies[0] / (studies[1] - studies[0])
     estimate = percent(limit / expected - 1)
     case.rows.append(
         Row("sand cylinder, extrapolated", "Lube et al. 2004", f"{expected:.2f}", f"{limit:.2f}", estimate)
