@@ -81,6 +81,22 @@ def test_a_block_as_stiff_as_steel_slides_like_a_rigid_one_in_frame_sized_steps(
     np.testing.assert_allclose(end.F, particles.F, atol=0.01)
 
 
+def test_bad_particles_are_counted_and_leave_the_others_finite():
+    particles, table = block(young=1e9)
+    bad = {
+        "NaN": eqx.tree_at(lambda p: p.x, particles, particles.x.at[3].set(jnp.nan)),
+        "far outside": eqx.tree_at(lambda p: p.x, particles, particles.x.at[3].set(1e6)),
+        "flat": eqx.tree_at(lambda p: p.F, particles, particles.F.at[3].set(0.0)),
+        "fast": eqx.tree_at(lambda p: p.v, particles, 1e5 * particles.v),
+    }
+    for name, given in bad.items():
+        end, _, health = run(given, table, 1, colliders=(FLOOR,), integrator="implicit", force=True)
+        finite = np.isfinite(end.x).all(1) & np.isfinite(end.v).all(1)
+        print(name, health.problems())
+        assert health.problems(), name
+        assert finite.sum() == len(particles) - (name == "NaN"), name
+
+
 @pytest.mark.slow
 def test_derivatives_go_through_implicit_steps(x64):
     """By the implicit function theorem, against central differences."""
