@@ -30,7 +30,7 @@ class SimConfig(eqx.Module):
     visual_stretch: tuple[float, float] = static_field(default=(0.2, 5.0))  # bounds of F_visual's singular values
     force: bool = static_field(default=False)  # run steps longer than the stable limit
     stop: bool = static_field(default=False)  # at the first bad frame: the rest repeats the last good one
-    newton_steps: int = static_field(default=16)  # of an implicit step, at most
+    newton_steps: int = static_field(default=30)  # of an implicit step, at most
     newton_tolerance: float = static_field(default=1e-3)  # momentum out of balance, relative to what drives the step
     krylov_steps: int = static_field(default=300)  # of a Newton step, at most
     box: tuple[int, int, int] | None = static_field(default=None)  # nodes that move with matter in jit, grad and vmap
