@@ -39,6 +39,7 @@ _INERTIA = 100.0  # what is in the way holds light matter as if it weighed so ma
 _LENGTHS = 6  # of a Newton step that are tried
 _PATIENCE = 4  # Newton steps without gain
 _FORCING = 0.05  # residual of the Krylov solve of a Newton step, relative to its right-hand side
+_ROUNDING = 1 / 16  # share of the worst case by which rounding keeps float32 from the balance, as met up to E = 1e11
 _EXACT = 1e-8  # the same where derivatives are wanted
 
 Limit = Callable[[Nodes], Nodes]  # velocities that what is in the way leaves of others
@@ -127,8 +128,8 @@ class _Best(NamedTuple):
 def _newton(step, modes, coarse, limit, residual, start):
     """The velocities nearest to balance that were met, and 1 if they are within the tolerance."""
     setting, scene = step.setting, step.scene
-    rounding = jnp.finfo(start.dtype).eps * scene.grid.dx / scene.dt * step.stiff
-    noise = jnp.sqrt((rounding**2 / step.scale).sum()) / 16
+    rounding = _ROUNDING * jnp.finfo(start.dtype).eps * scene.grid.dx / scene.dt * step.stiff
+    noise = jnp.sqrt((rounding**2 / step.scale).sum())
 
     def unfinished(carry):
         count, _, _, best, last = carry

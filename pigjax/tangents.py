@@ -112,7 +112,7 @@ def masses(setting: Setting, scene: Scene, states: tuple[Any, ...]) -> Float[Arr
                 own = state.mass[0] if state.row is None else jnp.where(state.row[0] == row, state.mass[0], 0)
                 return first, _spread(setting, scene, distance, state, 0.0, mass=own)
 
-            own = Setting(**setting._asdict() | {"laws": setting.laws[group : group + 1]})
+            own = setting._replace(laws=setting.laws[group : group + 1])
             part = scene._replace(parameters=(parameters,))
             found.append(_over_chunks(own, part, states[group : group + 1], visit)[..., :1])
     return jnp.concatenate(found, -1)

@@ -159,8 +159,8 @@ def sand_cylinder():
     """A cylinder of the same sand, a quarter of it between smooth walls.
 
     Lube et al. (2004, doi 10.1017/S0022112004009036): 1.24 a or 1.6 √a. It spreads thinner than the columns in plane
-    strain, and falls short by more until cells are as small as theirs: 24 to the radius. The last row takes the run-out
-    as linear in the size of a cell and draws it to zero: an estimate, not a simulation.
+    strain: with as many cells it falls short by more, and gains as they shrink. The last row takes the run-out as
+    linear in the size of a cell and draws it to zero: an estimate, not a simulation.
     """
     studies = (12, 24)
     case = _columns("sand cylinder", [(1.0, cells) for cells in studies], axisymmetric=True)
