@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from pigjax.transfers import Kernel, add_windows, first_nodes, stage, take_windows
+from pigjax.transfers import Kernel, add_windows, as_channels, stencil, take_windows
 
 
 class Pass(NamedTuple):
@@ -29,7 +29,7 @@ class Pass(NamedTuple):
 def scatter_chunks(
     own: Pass, go: Bool[Array, ""], cells: Float[Array, "n 3 c"], chunks: Any, shared: Any, *, ruled: bool
 ) -> Float[Array, "x y z 4"]:
-    """Grid to which each chunk at `cells` adds its windows, `own.function(go, cells, chunk, shared)` [n n n 4 c]."""
+    """Grid to which each chunk at `cells` adds its windows, `own.function(go, stencil, chunk, shared)` [c r k]."""
     run = _ruled_scatter if ruled else _scatter
     return run(own, go, (cells, chunks), shared)
 
@@ -37,19 +37,20 @@ def scatter_chunks(
 def gather_chunks(
     own: Pass, go: Bool[Array, ""], grid: Float[Array, "x y z 3"], chunks: Any, shared: Any, tally: Any, *, ruled: bool
 ) -> tuple[Any, Any]:
-    """Chunks after `own.function(go, windows, chunk, shared)` with windows [n n n 3 c], and the tally of them all.
+    """Chunks after `own.function(go, stencil, windows, chunk, shared)` with windows [c r k], and the tally of them all.
 
-    The function returns the chunk's new arrays in the form of the old ones, whose first are the cells [n 3 c], and its
-    tally, which has no derivative.
+    The function returns the chunk's new arrays in the form of the old ones, which have `cells` [n 3 c], and its tally,
+    which has no derivative.
     """
     run = _ruled_gather if ruled else _gather
-    return run(own, go, grid, chunks, shared, tally)
+    return run(own, go, as_channels(grid), chunks, shared, tally)
 
 
 def _scatter(own, go, chunks, shared):
     def visit(i, grid):
         cells, chunk = _chunk(chunks, i)
-        return add_windows(grid, _first(own, go, cells), own.function(go, cells, chunk, shared))
+        at = _stencil(own, go, cells)
+        return add_windows(grid, at, own.function(go, at, chunk, shared))
 
     return lax.fori_loop(0, len(chunks[0]), visit, jnp.zeros((*own.shape, 4), chunks[0].dtype))
 
@@ -69,9 +70,13 @@ def _scatter_backward(own, residuals, cotangent):
     def visit(i, carry):
         of_chunks, of_shared = carry
         cells, chunk = _chunk(chunks, i)
-        windows = take_windows(cotangent, _first(own, go, cells), own.kernel)
-        _, pull = jax.vjp(partial(own.function, go), cells, chunk, shared)
-        *of_chunk, more = pull(windows)
+        at = _stencil(own, go, cells)
+
+        def function(distance, chunk, shared):
+            return own.function(go, at._replace(distance=distance), chunk, shared)
+
+        _, pull = jax.vjp(function, at.distance, chunk, shared)
+        *of_chunk, more = pull(take_windows(cotangent, at))
         return _put(of_chunks, i, tuple(of_chunk)), jax.tree.map(jnp.add, of_shared, more)
 
     zeros = jax.tree.map(jnp.zeros_like, (chunks, shared))
@@ -85,11 +90,11 @@ def _gather(own, go, grid, chunks, shared, tally):
     def visit(i, carry):
         chunks, tally = carry
         chunk = _chunk(chunks, i)
-        windows = take_windows(grid, _first(own, go, chunk[0]), own.kernel)
-        new, more = own.function(go, windows, chunk, shared)
+        at = _stencil(own, go, chunk.cells)
+        new, more = own.function(go, at, take_windows(grid, at), chunk, shared)
         return _put(chunks, i, new), tally.joined(more)
 
-    return lax.fori_loop(0, len(chunks[0]), visit, (chunks, tally))
+    return lax.fori_loop(0, len(chunks.cells), visit, (chunks, tally))
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -108,22 +113,26 @@ def _gather_backward(own, residuals, cotangents):
     def visit(i, carry):
         of_grid, of_chunks, of_shared = carry
         chunk = _chunk(chunks, i)
-        first = _first(own, go, chunk[0])
-        windows = take_windows(grid, first, own.kernel)
-        _, pull, _ = jax.vjp(partial(own.function, go), windows, chunk, shared, has_aux=True)
-        of_windows, of_chunk, more = pull(_chunk(cotangent, i))
-        of_grid = add_windows(of_grid, first, of_windows)
+        at = _stencil(own, go, chunk.cells)
+
+        def function(distance, windows, chunk, shared):
+            return own.function(go, at._replace(distance=distance), windows, chunk, shared)
+
+        _, pull, _ = jax.vjp(function, at.distance, take_windows(grid, at), chunk, shared, has_aux=True)
+        of_distance, of_windows, of_chunk, more = pull(_chunk(cotangent, i))
+        of_chunk = of_chunk._replace(cells=of_chunk.cells + of_distance)
+        of_grid = add_windows(of_grid, at, of_windows)
         return of_grid, _put(of_chunks, i, of_chunk), jax.tree.map(jnp.add, of_shared, more)
 
     zeros = jax.tree.map(jnp.zeros_like, (grid, chunks, shared))
-    return (None, *lax.fori_loop(0, len(chunks[0]), visit, zeros), None)
+    return (None, *lax.fori_loop(0, len(chunks.cells), visit, zeros), None)
 
 
 _ruled_gather.defvjp(_gather_forward, _gather_backward)
 
 
-def _first(own, go, cells):
-    return stage(go, lambda cells: first_nodes(cells, own.kernel, own.shape), cells)
+def _stencil(own, go, cells):
+    return stencil(go, cells, own.kernel, own.shape)
 
 
 def _chunk(arrays, i):

@@ -22,13 +22,14 @@ from pigjax.matter.groups import by_component, by_row
 from pigjax.passes import Pass, gather_chunks, scatter_chunks
 from pigjax.transfers import (
     Kernel,
-    distances,
+    apic,
+    brought,
+    collect,
     first_nodes,
-    from_windows,
-    ruled_from_windows,
-    ruled_to_windows,
+    ruled_collect,
+    ruled_spread,
+    spread,
     stage,
-    to_windows,
 )
 
 
@@ -165,7 +166,7 @@ def _on_grid(setting, scene, states, nodes, time):
 
 def _to_grid(setting, scene, states):
     """Mass and momentum of the nodes [nx ny nz 4], with the impulse of the present stress in explicit steps."""
-    give = Pass(partial(_give, setting, scene.nodes), setting.kernel, scene.nodes)
+    give = Pass(partial(_give, setting), setting.kernel, scene.nodes)
     shared = (scene.dt, scene.grid.dx)
     total = jnp.zeros((*scene.nodes, 4), scene.dt.dtype)
     for state in states:
@@ -174,30 +175,28 @@ def _to_grid(setting, scene, states):
     return total if setting.axis is None else lax.psum(total, setting.axis)
 
 
-def _give(setting, shape, go, cells, chunk, shared):
+def _give(setting, go, at, chunk, shared):
     """Windows of a chunk."""
     dt, dx = shared
-    v, _, _, mass, _ = chunk
-    transfer = ruled_to_windows if setting.ruled else to_windows
 
-    def affine(v, C, stress, mass, volume):
-        kept = dx * mass * by_component(C)
-        if setting.balance is not None:
-            return kept
-        return kept - (dt * setting.kernel.inverse_inertia / dx) * volume * by_component(stress)
+    def bring(distance, v, C, stress, mass, volume):
+        affine = dx * mass * by_component(C)
+        if setting.balance is None:
+            affine = affine - (dt * setting.kernel.inverse_inertia / dx) * volume * by_component(stress)
+        return brought(distance, mass[0], v, affine)
 
-    distance = stage(go, lambda cells: distances(cells, setting.kernel, shape), cells)
-    return transfer(setting.kernel, go, distance, mass[0], v, stage(go, affine, *chunk))
+    transfer = ruled_spread if setting.ruled else spread
+    return transfer(setting.kernel, go, at, stage(go, bring, at.distance, *chunk))
 
 
-def _take(setting, shape, bodies, law, go, windows, state, shared):
+def _take(setting, shape, bodies, law, go, at, windows, state, shared):
     """A chunk after the step, and its tally."""
     dt, dx, parameters = shared
-    transfer = ruled_from_windows if setting.ruled else from_windows
-    distance = stage(go, lambda cells: distances(cells, setting.kernel, shape), state.cells)
-    v, per_cell = transfer(setting.kernel, go, distance, windows)
+    transfer = ruled_collect if setting.ruled else collect
+    moments = transfer(setting.kernel, go, at, windows)
+    v, per_cell = stage(go, partial(apic, setting.kernel), at.distance, moments)
     with jax.named_scope("law"):
-        new = stage(go, partial(_respond, law), state, v, per_cell, dt, dx, parameters)
+        new = in_rows(stage(go, partial(_respond, law), state, v, per_cell, dt, dx, parameters))
     return _settle(shape, bodies, go, new, state)
 
 
@@ -232,7 +231,7 @@ def _check(shape, bodies, state, before, volume):
 
 
 def _respond(law, state, v, per_cell, dt, dx, parameters):
-    """State after the particles moved and their matter responded."""
+    """State after the particles moved and their matter responded, tensors by component."""
     rate = per_cell / dx
     if state.row is not None:
         parameters = parameters_of(parameters, state.row[0])
@@ -240,19 +239,25 @@ def _respond(law, state, v, per_cell, dt, dx, parameters):
     F, hardening, stress = respond(law, by_component(state.F), rate, dt, hardening, parameters)
     visual = state.visual
     if visual is not None:
-        visual = visual + by_row(dt * product(rate, by_component(visual)))
+        visual = by_component(visual) + dt * product(rate, by_component(visual))
     way = dt / dx * v - state.rounded
     cells = state.cells + way
     return state._replace(
         cells=cells,
         rounded=lax.stop_gradient((cells - state.cells) - way),
         v=v,
-        C=by_row(rate),
-        F=by_row(F),
-        stress=by_row(stress),
+        C=rate,
+        F=F,
+        stress=stress,
         hardening=None if hardening is None else hardening[None],
         visual=visual,
     )
+
+
+def in_rows(state: State) -> State:
+    """A state's tensors as rows; outside of a stage, where XLA:CPU would write them number by number."""
+    tensors = {"C": state.C, "F": state.F, "stress": state.stress, "visual": state.visual}
+    return state._replace(**{name: by_row(tensor) for name, tensor in tensors.items() if tensor is not None})
 
 
 def parameters_of(parameters, row):
@@ -342,7 +347,7 @@ def touched_nodes(grid: Grid, x: Float[Array, "p 3"], kernel: Kernel) -> Bool[Ar
     last = jnp.asarray(grid.shape, x.dtype) - 1
     near = ((cells >= -1) & (cells <= last + 1)).all(1)
     cells = jnp.clip(cells, 1, last - 1)
-    first = first_nodes(cells.T, kernel, grid.shape)
+    first = first_nodes(cells.T, kernel, grid.shape).T
     offsets = np.stack(np.meshgrid(*[np.arange(len(kernel.offsets))] * 3, indexing="ij"), -1).reshape(-1, 3)
     i, j, k = jnp.moveaxis(first[:, None] + offsets, -1, 0)
     return jnp.zeros(grid.shape, bool).at[i, j, k].max(near[:, None])

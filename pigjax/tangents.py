@@ -14,20 +14,32 @@ from pigjax.materials import LAWS, respond
 from pigjax.materials.tensors import cofactors, determinant, identity, product
 from pigjax.matter.groups import by_component
 from pigjax.substep import Scene, Setting, parameters_of
-from pigjax.transfers import add_windows, distances, first_nodes, from_windows, stage, take_windows, to_windows
+from pigjax.transfers import (
+    CHANNELS,
+    add_windows,
+    apic,
+    as_channels,
+    brought,
+    collect,
+    spread,
+    stage,
+    stencil,
+    take_windows,
+)
 
 Nodes = Float[Array, "x y z 3"]
 
 
 def forces(setting: Setting, scene: Scene, states: tuple[Any, ...], v: Nodes) -> Nodes:
     """Forces [N] of the stresses after a step with velocities v [m/s] of the nodes."""
+    nodes = as_channels(v)
 
     def visit(law, parameters, state):
-        """First nodes and windows of one chunk."""
-        first, distance = _places(setting, scene, state)
-        _, per_cell = from_windows(setting.kernel, scene.go, distance, take_windows(v, first, setting.kernel))
+        """Stencil and windows of one chunk."""
+        at = _stencil(setting, scene, state)
+        per_cell = _gradient(setting, scene, at, nodes)
         pulled = stage(scene.go, partial(_pulled, setting, scene, law, parameters), state, per_cell)
-        return first, _spread(setting, scene, distance, state, pulled)
+        return at, _spread(setting, scene, at, state, pulled)
 
     return _over_chunks(setting, scene, states, visit)[..., 1:]
 
@@ -42,28 +54,29 @@ class Tangents(NamedTuple):
 
     def __call__(self, change: Nodes) -> Nodes:
         """Change of the forces [N] with a change of velocities [m/s]: a transfer there and back, and no law."""
-        setting, scene = self.setting, self.scene
+        setting, scene, nodes = self.setting, self.scene, as_channels(change)
 
         def visit(law, parameters, state_and_slope):
             state, slope = state_and_slope
-            first, distance = _places(setting, scene, state)
-            _, per_cell = from_windows(setting.kernel, scene.go, distance, take_windows(change, first, setting.kernel))
+            at = _stencil(setting, scene, state)
+            per_cell = _gradient(setting, scene, at, nodes)
 
             def pulled(slope, per_cell):
                 return sum(row * rate for row, rate in zip(slope, per_cell.reshape(9, 1, -1))).reshape(3, 3, -1)
 
-            return first, _spread(setting, scene, distance, state, stage(scene.go, pulled, slope, per_cell))
+            return at, _spread(setting, scene, at, state, stage(scene.go, pulled, slope, per_cell))
 
         return _over_chunks(setting, scene, tuple(zip(self.states, self.slopes)), visit)[..., 1:]
 
 
 def tangents(setting: Setting, scene: Scene, states: tuple[Any, ...], v: Nodes) -> Tangents:
     """Derivatives of `forces` at v, kept as 81 numbers a particle: a Krylov solve then meets no law."""
+    nodes = as_channels(v)
 
     def of_law(law, parameters, state):
         def of_chunk(state):
-            first, distance = _places(setting, scene, state)
-            _, per_cell = from_windows(setting.kernel, scene.go, distance, take_windows(v, first, setting.kernel))
+            at = _stencil(setting, scene, state)
+            per_cell = _gradient(setting, scene, at, nodes)
             function = partial(_pulled, setting, scene, law, parameters, state)
             units = jnp.eye(9, dtype=v.dtype).reshape(9, 3, 3, 1)
 
@@ -84,33 +97,34 @@ def stiffness(setting: Setting, scene: Scene, states: tuple[Any, ...]) -> Float[
 
     def visit(law, parameters, state):
         own = parameters if state.row is None else parameters_of(parameters, state.row[0])
-        first, distance = _places(setting, scene, state)
+        at = _stencil(setting, scene, state)
         spring = state.volume[0] * LAWS[law].modulus(own) * (kernel.inverse_inertia * scene.dt / scene.grid.dx) ** 2
-        return first, stage(scene.go, partial(_squares, kernel), distance, spring)[:, :, :, None]
+        return at, stage(scene.go, partial(_squares, kernel), at.distance, spring)
 
-    return _over_chunks(setting, scene, states, visit, channels=1)
+    return _over_chunks(setting, scene, states, visit)[..., :1]
 
 
 def _squares(kernel, distance, factor):
-    """Squares of what each node of a window [n n n c] has to do with the gradient of velocity: Σ (wᵢ oᵢ)²."""
+    """Windows [c r k] of squares of what each node has to do with the gradient of velocity, Σ (wᵢ oᵢ)², as mass."""
     weights = jnp.stack(kernel.weights(distance)) ** 2
     offsets = (jnp.asarray(kernel.offsets, distance.dtype)[:, None, None] - distance) ** 2
     (wx, wy, wz), (x, y, z) = jnp.moveaxis(weights, 1, 0), jnp.moveaxis(offsets, 1, 0)
     lengths = x[:, None, None] + y[None, :, None] + z[None, None, :]
-    return factor * wx[:, None, None] * wy[None, :, None] * wz[None, None, :] * lengths
+    squares = jnp.moveaxis(factor * wx[:, None, None] * wy[None, :, None] * wz[None, None, :] * lengths, -1, 0)
+    return as_channels(squares[..., None]).reshape(len(squares), len(kernel.offsets) ** 2, -1)
 
 
 def masses(setting: Setting, scene: Scene, states: tuple[Any, ...]) -> Float[Array, "x y z b"]:
     """Mass of the nodes [kg] that each material brings; materials are those of the table that move, law by law."""
     found = []
     for group, parameters in enumerate(scene.parameters):
-        rows = len(jnp.atleast_1d(parameters.density))
-        for row in range(rows):
+        materials = len(jnp.atleast_1d(parameters.density))
+        for row in range(materials):
 
             def visit(law, parameters, state, row=row):
-                first, distance = _places(setting, scene, state)
+                at = _stencil(setting, scene, state)
                 own = state.mass[0] if state.row is None else jnp.where(state.row[0] == row, state.mass[0], 0)
-                return first, _spread(setting, scene, distance, state, 0.0, mass=own)
+                return at, _spread(setting, scene, at, state, 0.0, mass=own)
 
             own = setting._replace(laws=setting.laws[group : group + 1])
             part = scene._replace(parameters=(parameters,))
@@ -130,23 +144,27 @@ def _pulled(setting, scene, law, parameters, state, per_cell):
     return (-setting.kernel.inverse_inertia / scene.grid.dx) * state.volume * pulled
 
 
-def _places(setting, scene, state):
-    """First nodes of the windows of a chunk, and the distances to their nodes in the middle."""
-    kernel, shape, go = setting.kernel, scene.grid.shape, scene.go
-    first = stage(go, lambda cells: first_nodes(cells, kernel, shape), state.cells)
-    return first, stage(go, lambda cells: distances(cells, kernel, shape), state.cells)
+def _stencil(setting, scene, state):
+    return stencil(scene.go, state.cells, setting.kernel, scene.grid.shape)
 
 
-def _spread(setting, scene, distance, state, affine, mass=None):
-    """Windows of a chunk [n n n 4 c]: `mass`, and forces that grow linearly."""
+def _gradient(setting, scene, at, nodes):
+    """Gradient of the nodes' velocities around particles [m/s per cell]."""
+    moments = collect(setting.kernel, scene.go, at, take_windows(nodes, at))
+    return stage(scene.go, partial(apic, setting.kernel), at.distance, moments)[1]
+
+
+def _spread(setting, scene, at, state, affine, mass=None):
+    """Windows of a chunk [c r k]: `mass`, and forces that grow linearly."""
     mass = jnp.zeros_like(state.volume[0]) if mass is None else mass
     affine = jnp.broadcast_to(affine, (3, *state.v.shape))
-    return to_windows(setting.kernel, scene.go, distance, mass, jnp.zeros_like(state.v), affine)
+    polynomial = stage(scene.go, brought, at.distance, mass, jnp.zeros_like(state.v), affine)
+    return spread(setting.kernel, scene.go, at, polynomial)
 
 
-def _over_chunks(setting, scene, states, visit, channels=4):
-    """Grid [nx ny nz k] with the windows of all chunks added up; chunks are computed anew in reverse mode."""
-    nothing = jnp.zeros((*scene.grid.shape, channels), scene.dt.dtype)
+def _over_chunks(setting, scene, states, visit):
+    """Grid [nx ny nz 4] with the windows of all chunks added up; chunks are computed anew in reverse mode."""
+    nothing = jnp.zeros((*scene.grid.shape, CHANNELS), scene.dt.dtype)
     total = nothing
     for law, parameters, state in zip(setting.laws, scene.parameters, states):
 

@@ -1,20 +1,29 @@
 """Particle-grid transfers of one chunk of particles: B-spline stencils, APIC to the grid and back.
 
-Inside, arrays are component-first, particles last: `[3, c]`, `[n, n, n, k, c]`, so that one machine vector holds many
-particles. Node windows are `[n, n, n]` with n = 3 (quadratic) or 4 (cubic).
+Numbers of particles are component-first, `[3, c]`, so that one machine vector holds many particles. Windows of nodes are
+particle-first, `[c, r, k]`: rows along z of n nodes (3 quadratic, 4 cubic) with 4 numbers each, r = n², k = 4 n, so that
+a row is added and read as it lies in the grid.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
+
+from pigjax.errors import InputError
+
+Rows: TypeAlias = Float[Array, "c 4"]
+Moments: TypeAlias = tuple[Rows, Rows, Rows, Rows]
+Windows: TypeAlias = Float[Array, "c r k"]
+CHANNELS = 4  # numbers of a node: mass and momentum, or velocity and a zero; they fill a machine vector
 
 
 class Kernel(NamedTuple):
@@ -63,13 +72,44 @@ def stage(go: Bool[Array, ""], function: Callable, *args: Any) -> Any:
     return lax.cond(go, function, lambda *_: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), *args)
 
 
-def first_nodes(cells: Float[Array, "3 c"], kernel: Kernel, shape: tuple[int, int, int]) -> Int[Array, "c 3"]:
+class Stencil(NamedTuple):
+    """Where the windows of particles lie, and the weights of their nodes."""
+
+    rows: Int[Array, "c r"]  # beginnings of the rows along z in the grid [x y z 4], laid flat
+    distance: Float[Array, "3 c"]  # from the nodes at offset 0 [cells]
+    along: Float[Array, "c 2 n"]  # weights along x, and those times offsets
+    plane: Float[Array, "c r"]  # weights along y times those along z
+
+
+def stencil(
+    go: Bool[Array, ""], cells: Float[Array, "3 c"], kernel: Kernel, shape: tuple[int, int, int]
+) -> Stencil:
+    """Stencil of particles at `cells`, positions in cells from the first node of a grid of a given shape.
+
+    Raises:
+        InputError: the grid has more numbers than 32 bits count.
+    """
+    if CHANNELS * math.prod(shape) > np.iinfo(np.int32).max:
+        raise InputError(f"a grid of {shape} nodes is too large to be held at once: give SimConfig(box=...).")
+    n, (_, ny, nz) = len(kernel.offsets), shape
+    planes, rows = np.indices((n, n), np.int32).reshape(2, -1)
+
+    def places(cells):
+        x, y, z = first_nodes(cells, kernel, shape)
+        distance = distances(cells, kernel, shape)
+        return CHANNELS * ((x * ny + y) * nz + z), distance, *_weights(kernel, distance)
+
+    first, *others = stage(go, places, cells)
+    return Stencil(stage(go, lambda first: first[:, None] + CHANNELS * nz * (planes * ny + rows), first), *others)
+
+
+def first_nodes(cells: Float[Array, "3 c"], kernel: Kernel, shape: tuple[int, int, int]) -> Int[Array, "3 c"]:
     """First nodes of the windows of particles at `cells`, at least one cell inside."""
-    return _anchor(cells, kernel, shape).astype(jnp.int32).T + kernel.offsets[0]
+    return _anchor(cells, kernel, shape).astype(jnp.int32) + kernel.offsets[0]
 
 
 def distances(cells: Float[Array, "3 c"], kernel: Kernel, shape: tuple[int, int, int]) -> Float[Array, "3 c"]:
-    """Distances from the nodes at offset 0 of particles at `cells`, positions in cells from the grid's first node."""
+    """Distances from the nodes at offset 0 of particles at `cells`."""
     return cells - _anchor(cells, kernel, shape)
 
 
@@ -79,154 +119,171 @@ def _anchor(cells, kernel, shape):
     return jnp.clip(jnp.round(cells) if kernel.nearest else jnp.floor(cells), -kernel.offsets[0], last[:, None])
 
 
-def to_windows(
-    kernel: Kernel,
-    go: Bool[Array, ""],
-    distance: Float[Array, "3 c"],
-    mass: Float[Array, "c"],
-    v: Float[Array, "3 c"],
-    affine: Float[Array, "3 3 c"],
-) -> Float[Array, "n n n 4 c"]:
-    """Mass [kg] and momentum [kg m/s] for the nodes: wᵢ (m, m v + B oᵢ), oᵢ the way from the particle [cells].
+def brought(
+    distance: Float[Array, "3 c"], mass: Float[Array, "c"], v: Float[Array, "3 c"], affine: Float[Array, "3 3 c"]
+) -> Moments:
+    """Mass [kg] and momentum [kg m/s] for a node, (m, m v + B (o − d)), as constant and slopes by its offset o.
 
     `affine` B holds APIC's C and, by MLS-MPM, the stress (Hu et al. 2018, doi 10.1145/3197517.3201293, eq. 16).
     """
-    constant, slopes = stage(go, _brought, distance, mass, v, affine)
-    return stage(go, partial(_expand, kernel), distance, constant, slopes)
-
-
-def from_windows(
-    kernel: Kernel, go: Bool[Array, ""], distance: Float[Array, "3 c"], windows: Float[Array, "n n n 3 c"]
-) -> tuple[Float[Array, "3 c"], Float[Array, "3 3 c"]]:
-    """Velocity [m/s], and its gradient by APIC in units of m/s per cell: Σ wᵢ vᵢ and D⁻¹ Σ wᵢ vᵢ oᵢᵀ."""
-
-    def moments(windows, distance):
-        v, gradient = _moments(kernel, windows, distance)
-        return v, kernel.inverse_inertia * gradient
-
-    return stage(go, moments, windows, distance)
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def ruled_to_windows(kernel, go, distance, mass, v, affine):
-    """`to_windows` with a reverse-mode rule: cotangents are gathered as velocities are."""
-    return to_windows(kernel, go, distance, mass, v, affine)
-
-
-def _to_backward(kernel, residuals, cotangent):
-    go, distance, mass, v, affine = residuals
-
-    def pull(windows, distance, mass, v, affine):
-        (of_mass, *total), first = _moments(kernel, windows, distance)
-        total = jnp.stack(total)
-        return of_mass + (v * total).sum(0), mass * total, first[1:], (affine * total[:, None]).sum(0)
-
-    constant, slopes = stage(go, _brought, distance, mass, v, affine)
-    slope = stage(go, partial(_slope, kernel), distance, cotangent, constant, slopes)
-    of_mass, of_v, of_affine, shift = stage(go, pull, cotangent, distance, mass, v, affine)
-    return None, slope - shift, of_mass, of_v, of_affine
-
-
-ruled_to_windows.defvjp(lambda kernel, *inputs: (ruled_to_windows(kernel, *inputs), inputs), _to_backward)
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def ruled_from_windows(kernel, go, distance, windows):
-    """`from_windows` with a reverse-mode rule: cotangents are spread as momentum is."""
-    return from_windows(kernel, go, distance, windows)
-
-
-def _from_backward(kernel, residuals, cotangents):
-    (go, distance, windows), v = residuals
-
-    def polynomial(distance, of_v, of_gradient):
-        slopes = kernel.inverse_inertia * of_gradient
-        return of_v - (slopes * distance).sum(1), jnp.moveaxis(slopes, 1, 0)
-
-    constant, slopes = stage(go, polynomial, distance, *cotangents)
-    of_windows = stage(go, partial(_expand, kernel), distance, constant, slopes)
-    slope = stage(go, partial(_slope, kernel), distance, windows, constant, slopes)
-    return None, slope - (slopes * v).sum(1), of_windows
-
-
-def _from_forward(kernel, *inputs):
-    out = from_windows(kernel, *inputs)
-    return out, (inputs, out[0])
-
-
-ruled_from_windows.defvjp(_from_forward, _from_backward)
-
-
-def _brought(distance, mass, v, affine):
-    """What particles bring to a node, as a polynomial of its offset: constant [4 c] and slopes [3 4 c]."""
     constant = jnp.concatenate([mass[None], mass * v - (affine * distance).sum(1)])
-    slopes = jnp.concatenate([jnp.zeros_like(affine[:1]), affine]).swapaxes(0, 1)
-    return constant, slopes
+    x, y, z = jnp.concatenate([jnp.zeros_like(affine[:1]), affine]).swapaxes(0, 1)
+    return constant.T, x.T, y.T, z.T
 
 
-def _values(kernel, constant, slopes):
-    """The polynomial at the window's nodes [n n n k c]."""
-    x, y, z = _offset_axes(kernel, 5, constant.dtype)
-    return constant + slopes[0] * x + slopes[1] * y + slopes[2] * z
+def apic(
+    kernel: Kernel, distance: Float[Array, "3 c"], moments: Moments
+) -> tuple[Float[Array, "3 c"], Float[Array, "3 3 c"]]:
+    """Velocity [m/s] and its gradient in units of m/s per cell, Σ wᵢ vᵢ and D⁻¹ Σ wᵢ vᵢ (oᵢ − d)ᵀ."""
+    v, *first = (moment.T[:3] for moment in moments)
+    return v, kernel.inverse_inertia * (jnp.stack(first, 1) - v[:, None] * distance)
 
 
-def _expand(kernel, distance, constant, slopes):
-    """The polynomial at the window's nodes, weighted."""
-    wx, wy, wz = jnp.moveaxis(jnp.stack(kernel.weights(distance)), 1, 0)
-    weights = wx[:, None, None] * wy[None, :, None] * wz[None, None, :]
-    return weights[:, :, :, None] * _values(kernel, constant, slopes)
+def spread(kernel: Kernel, go: Bool[Array, ""], at: Stencil, polynomial: Moments) -> Windows:
+    """wᵢ (p + p' oᵢ) for the nodes, p and p' being the constant and the slopes along x, y and z of a polynomial."""
+
+    def planes(plane, constant, *slopes):
+        nodes = plane[:, :, None]
+        return nodes * _in_plane(kernel, constant, *slopes[1:]), nodes * slopes[0][:, None]
+
+    def windows(along, constant, slope):
+        return along[:, 0, :, None] * constant[:, None] + along[:, 1, :, None] * slope[:, None]
+
+    flat = [nodes.reshape(len(nodes), -1) for nodes in stage(go, planes, at.plane, *polynomial)]
+    return stage(go, windows, at.along, *flat).reshape(*at.rows.shape, -1)
 
 
-def _moments(kernel, windows, distance):
-    """Σ wᵢ uᵢ [k c] and Σ wᵢ uᵢ oᵢᵀ [k 3 c] of windows u."""
-    weights = _by_axis(kernel.weights(distance))
-    moments = [[offset * w for offset, w in zip(kernel.offsets, row)] for row in weights]
-    total, *first = _sums(windows, weights, moments)
-    return total, jnp.stack([m - d * total for m, d in zip(first, distance)], 1)
+def collect(kernel: Kernel, go: Bool[Array, ""], at: Stencil, windows: Windows) -> Moments:
+    """The transpose of `spread`: Σ wᵢ uᵢ and Σ wᵢ uᵢ oᵢ, with the offsets along x, y and z, of windows u."""
+    return _moments(kernel, go, _over_x(go, at.along, windows), at.plane)
 
 
-def _slope(kernel, distance, windows, constant, slopes):
-    """Σ ∇wᵢ uᵢ·pᵢ [3 c] of windows u and a polynomial p."""
-    field = (windows * _values(kernel, constant, slopes)).sum(3)
-    _, *slope = _sums(field, _by_axis(kernel.weights(distance)), _by_axis(kernel.slopes(distance)))
-    return jnp.stack(slope)
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def ruled_spread(kernel, go, at, polynomial):
+    """`spread` with a reverse-mode rule, by which weights depend on `at.distance` and no other derivative counts."""
+    return spread(kernel, go, at, polynomial)
 
 
-def _sums(windows, weights, others):
-    """Σ w u over the window, and the same with the other weights along x, y or z; axis after axis: z, y, x."""
-
-    def along(axis, rows, weights):
-        return sum(w * lax.index_in_dim(rows, k, axis, keepdims=False) for k, w in enumerate(weights))
-
-    z, z_other = along(2, windows, weights[2]), along(2, windows, others[2])
-    y, y_other, yz = along(1, z, weights[1]), along(1, z, others[1]), along(1, z_other, weights[1])
-    return along(0, y, weights[0]), along(0, y, others[0]), along(0, y_other, weights[0]), along(0, yz, weights[0])
+def _spread_backward(kernel, residuals, cotangent):
+    go, at, polynomial = residuals
+    planes = _over_x(go, at.along, cotangent)
+    return None, _slope(kernel, go, at, cotangent, planes, polynomial), _moments(kernel, go, planes, at.plane)
 
 
-def _by_axis(weights):
-    return [[w[axis] for w in weights] for axis in range(3)]
+ruled_spread.defvjp(lambda kernel, *inputs: (ruled_spread(kernel, *inputs), inputs), _spread_backward)
 
 
-def add_windows(grid: Float[Array, "x y z k"], first, windows) -> Float[Array, "x y z k"]:
-    """Grid with the windows [n n n k c] added where their first nodes [c 3] are."""
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def ruled_collect(kernel, go, at, windows):
+    """`collect` with a reverse-mode rule like that of `ruled_spread`."""
+    return collect(kernel, go, at, windows)
+
+
+def _collect_backward(kernel, residuals, cotangents):
+    go, at, windows = residuals
+    slope = _slope(kernel, go, at, windows, _over_x(go, at.along, windows), cotangents)
+    return None, slope, spread(kernel, go, at, cotangents)
+
+
+ruled_collect.defvjp(lambda kernel, *inputs: (ruled_collect(kernel, *inputs), inputs), _collect_backward)
+
+
+def _weights(kernel, distance):
+    """Weights as a stencil has them."""
+    weights = kernel.weights(distance)
+    return _along_x(kernel, weights), _of_plane(weights, weights)
+
+
+def _along_x(kernel, weights):
+    first = [offset * w[0] for offset, w in zip(kernel.offsets, weights)]
+    return jnp.stack([jnp.stack([w[0] for w in weights], -1), jnp.stack(first, -1)], 1)
+
+
+def _of_plane(along_y, along_z):
+    return jnp.stack([y[1] * z[2] for y in along_y for z in along_z], -1)
+
+
+def _in_plane(kernel, constant, slope_y, slope_z):
+    """A polynomial at the nodes of a plane [c r 4]."""
+    y, z = np.stack(np.meshgrid(kernel.offsets, kernel.offsets, indexing="ij")).reshape(2, -1, 1).astype(constant.dtype)
+    return constant[:, None] + slope_y[:, None] * y + slope_z[:, None] * z
+
+
+def _over_x(go, along, windows):
+    """Sums of windows along x, by weights and by weights times offsets `along` [c 2 n]: [c 2 4 r]."""
+
+    def sums(along, windows):
+        planes = windows.reshape(*along[:, 0].shape, -1)
+        return sum(along[:, :, i, None] * planes[:, None, i] for i in range(along.shape[2]))
+
+    return stage(go, sums, along, windows)
+
+
+def _moments(kernel, go, planes, plane):
+    """What `collect` finds, from sums along x."""
+    nodes = [(y, z) for y in kernel.offsets for z in kernel.offsets]
+
+    def sums(planes, plane):
+        planes = planes.reshape(*planes.shape[:2], len(nodes), CHANNELS)
+
+        def total(values, factors):
+            return sum(f * plane[:, k, None] * values[:, k] for k, f in enumerate(factors) if f)
+
+        ones = [1] * len(nodes)
+        by_offset = (total(planes[:, 0], offsets) for offsets in zip(*nodes))
+        return total(planes[:, 0], ones), total(planes[:, 1], ones), *by_offset
+
+    return stage(go, sums, planes, plane)
+
+
+def _slope(kernel, go, at, windows, planes, polynomial):
+    """Cotangent of a stencil: Σ ∇wᵢ uᵢ·pᵢ of windows u, whose sums along x `planes` holds, and a polynomial p."""
+
+    def steep(distance):
+        weights, slopes = kernel.weights(distance), kernel.slopes(distance)
+        return _along_x(kernel, slopes), _of_plane(slopes, weights), _of_plane(weights, slopes)
+
+    def meet(steep_planes, planes, constant, slope_x, *others):
+        at_nodes = _in_plane(kernel, constant, *others)
+
+        def met(planes):
+            values = planes.reshape(-1, 2, *at_nodes.shape[1:])
+            return values[:, 0] * at_nodes + values[:, 1] * slope_x[:, None]
+
+        return met(steep_planes), met(planes)
+
+    def sums(by_x, by_others, *weights):
+        pairs = zip(weights, (by_x, by_others, by_others))
+        return tuple(sum(w[:, k, None] * u[:, k] for k in range(w.shape[1])) for w, u in pairs)
+
+    along, *others = stage(go, steep, at.distance)
+    met = stage(go, meet, _over_x(go, along, windows), planes, *polynomial)
+    rows = stage(go, sums, *met, at.plane, *others)
+    slope = stage(go, lambda *rows: jnp.stack([row.T.sum(0) for row in rows]), *rows)
+    return Stencil(None, slope, None, None)
+
+
+def as_channels(nodes: Float[Array, "*n k"]) -> Float[Array, "*n 4"]:
+    """Up to 4 numbers of nodes, with zeros for the others."""
+    return jnp.pad(nodes, [(0, 0)] * (nodes.ndim - 1) + [(0, CHANNELS - nodes.shape[-1])])
+
+
+def add_windows(grid: Float[Array, "x y z 4"], at: Stencil, windows: Windows) -> Float[Array, "x y z 4"]:
+    """Grid with windows added."""
     with jax.named_scope("add_windows"):
-        return lax.scatter_add(grid, first, windows, _SCATTER, mode=_IN_BOUNDS)
+        flat = lax.scatter_add(grid.reshape(-1), at.rows[..., None], windows, _SCATTER, mode=_IN_BOUNDS)
+        return flat.reshape(grid.shape)
 
 
-def take_windows(grid: Float[Array, "x y z k"], first, kernel: Kernel) -> Float[Array, "n n n k c"]:
-    """Windows of the grid at their first nodes [c 3]."""
-    n = len(kernel.offsets)
+def take_windows(grid: Float[Array, "x y z 4"], at: Stencil) -> Windows:
+    """Windows of a grid."""
     with jax.named_scope("take_windows"):
-        return lax.gather(grid, first, _GATHER, (n, n, n, grid.shape[-1]), mode=_IN_BOUNDS)
-
-
-def _offset_axes(kernel: Kernel, ndim: int, dtype) -> list[np.ndarray]:
-    offsets = np.array(kernel.offsets, dtype)
-    return [offsets.reshape([-1 if k == axis else 1 for k in range(ndim)]) for axis in range(3)]
+        size = (at.along.shape[2] * CHANNELS,)
+        return lax.gather(grid.reshape(-1), at.rows[..., None], _GATHER, size, mode=_IN_BOUNDS)
 
 
 _IN_BOUNDS = lax.GatherScatterMode.PROMISE_IN_BOUNDS
 _SCATTER = lax.ScatterDimensionNumbers(
-    update_window_dims=(0, 1, 2, 3), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1, 2)
+    update_window_dims=(2,), inserted_window_dims=(), scatter_dims_to_operand_dims=(0,)
 )
-_GATHER = lax.GatherDimensionNumbers(offset_dims=(0, 1, 2, 3), collapsed_slice_dims=(), start_index_map=(0, 1, 2))
+_GATHER = lax.GatherDimensionNumbers(offset_dims=(2,), collapsed_slice_dims=(), start_index_map=(0,))
