@@ -1,8 +1,8 @@
 """Particle-grid transfers of one chunk of particles: B-spline stencils, APIC to the grid and back.
 
-Numbers of particles are component-first, `[3, c]`, so that one machine vector holds many particles. Windows of nodes are
-particle-first, `[c, r, k]`: rows along z of n nodes (3 quadratic, 4 cubic) with 4 numbers each, r = n², k = 4 n, so that
-a row is added and read as it lies in the grid.
+Numbers of particles are component-first, `[3, c]`, so that one machine vector holds many particles. Windows of nodes
+are particle-first, `[c, r, k]`: rows along z of n nodes (3 quadratic, 4 cubic) with 4 numbers each, r = n², k = 4 n, so
+that a row is added and read as it lies in the grid.
 """
 
 from __future__ import annotations
@@ -81,9 +81,7 @@ class Stencil(NamedTuple):
     plane: Float[Array, "c r"]  # weights along y times those along z
 
 
-def stencil(
-    go: Bool[Array, ""], cells: Float[Array, "3 c"], kernel: Kernel, shape: tuple[int, int, int]
-) -> Stencil:
+def stencil(go: Bool[Array, ""], cells: Float[Array, "3 c"], kernel: Kernel, shape: tuple[int, int, int]) -> Stencil:
     """Stencil of particles at `cells`, positions in cells from the first node of a grid of a given shape.
 
     Raises:
@@ -194,6 +192,12 @@ def _weights(kernel, distance):
     return _along_x(kernel, weights), _of_plane(weights, weights)
 
 
+def _steep(kernel, distance):
+    """Derivatives of the weights: along x [c 2 n], and of a plane's nodes by y and by z [c r]."""
+    weights, slopes = kernel.weights(distance), kernel.slopes(distance)
+    return _along_x(kernel, slopes), _of_plane(slopes, weights), _of_plane(weights, slopes)
+
+
 def _along_x(kernel, weights):
     first = [offset * w[0] for offset, w in zip(kernel.offsets, weights)]
     return jnp.stack([jnp.stack([w[0] for w in weights], -1), jnp.stack(first, -1)], 1)
@@ -239,10 +243,6 @@ def _moments(kernel, go, planes, plane):
 def _slope(kernel, go, at, windows, planes, polynomial):
     """Cotangent of a stencil: Σ ∇wᵢ uᵢ·pᵢ of windows u, whose sums along x `planes` holds, and a polynomial p."""
 
-    def steep(distance):
-        weights, slopes = kernel.weights(distance), kernel.slopes(distance)
-        return _along_x(kernel, slopes), _of_plane(slopes, weights), _of_plane(weights, slopes)
-
     def meet(steep_planes, planes, constant, slope_x, *others):
         at_nodes = _in_plane(kernel, constant, *others)
 
@@ -256,11 +256,11 @@ def _slope(kernel, go, at, windows, planes, polynomial):
         pairs = zip(weights, (by_x, by_others, by_others))
         return tuple(sum(w[:, k, None] * u[:, k] for k in range(w.shape[1])) for w, u in pairs)
 
-    along, *others = stage(go, steep, at.distance)
+    along, *others = stage(go, partial(_steep, kernel), at.distance)
     met = stage(go, meet, _over_x(go, along, windows), planes, *polynomial)
     rows = stage(go, sums, *met, at.plane, *others)
     slope = stage(go, lambda *rows: jnp.stack([row.T.sum(0) for row in rows]), *rows)
-    return Stencil(None, slope, None, None)
+    return Stencil._make([None, slope, None, None])  # weights follow from the distance
 
 
 def as_channels(nodes: Float[Array, "*n k"]) -> Float[Array, "*n 4"]:

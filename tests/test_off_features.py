@@ -127,7 +127,7 @@ def test_a_law_reads_its_own_numbers_only(law):
 
 # what only the feature's own equations hold
 SIGNS = {
-    "cubic": (lambda: traced(kernel="cubic"), lambda p: "4,4,4" in text(p)),
+    "cubic": (lambda: traced(kernel="cubic"), lambda p: "slice_sizes=(16,)" in text(p)),
     "body contact": (lambda: traced(contact=BodyContact(bodies=2)), lambda p: in_steps(p)["scatter-add"] > 1),
     "implicit steps": (lambda: traced(integrator="implicit"), lambda p: "while" in text(p)),
     "fibres": (lambda: traced([material("fibres")]), lambda p: primitives(p)["cos"] > 0),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from unittest.mock import patch
 
 import jax
@@ -18,9 +19,9 @@ import numpy as np
 
 from pigjax import substep, transfers
 from pigjax.matter import fit_grid
-from pigjax.matter.groups import by_component, by_row
+from pigjax.matter.groups import by_component
 from pigjax.mls_mpm import SimConfig, rollout
-from pigjax.transfers import distances, stage
+from pigjax.transfers import stage
 from verification.bars import period
 from verification.common import NO_GRAVITY, Case, Row, elastic, in_float64, particles, percent
 from verification.kernels import KERNELS, energy_kept, ringing, turning
@@ -38,43 +39,50 @@ def classic_force():
         jax.clear_caches()
 
 
-def _give(setting, shape, go, cells, chunk, shared):
+def _give(setting, go, at, chunk, shared):
     """Windows of a chunk, as `substep._give`."""
     (dt, dx), kernel = shared, setting.kernel
 
-    def brought(distance, v, C, stress, mass, volume):
-        constant, slopes = transfers._brought(distance, mass[0], v, dx * mass * by_component(C))
-        impulse = -(dt / dx) * volume * by_component(stress).swapaxes(0, 1)
-        return constant, slopes, jnp.concatenate([jnp.zeros_like(impulse[:, :1]), impulse], 1)
+    def bring(distance, v, C, stress, mass, volume):
+        impulse = -(dt / dx) * volume * by_component(stress)
+        impulses = jnp.concatenate([jnp.zeros_like(impulse[:1]), impulse]).swapaxes(0, 1)
+        polynomial = transfers.brought(distance, mass[0], v, dx * mass * by_component(C))
+        return polynomial, [impulse.T for impulse in impulses], transfers._steep(kernel, distance)
 
-    def expand(distance, constant, slopes, impulse):
-        weights, steep = (jnp.moveaxis(jnp.stack(f(distance)), 1, 0) for f in (kernel.weights, kernel.slopes))
-        windows = transfers._expand(kernel, distance, constant, slopes)
-        for axis in range(3):
-            x, y, z = (steep[k] if k == axis else weights[k] for k in range(3))
-            gradient = x[:, None, None] * y[None, :, None] * z[None, None, :]
-            windows = windows + gradient[:, :, :, None] * impulse[axis]
-        return windows
+    def planes(plane, by_y, by_z, polynomial, impulses):
+        constant, x, *others = polynomial
+        nodes, (along_x, along_y, along_z) = plane[:, :, None], (impulse[:, None] for impulse in impulses)
+        steep = by_y[:, :, None] * along_y + by_z[:, :, None] * along_z
+        return nodes * transfers._in_plane(kernel, constant, *others) + steep, nodes * x[:, None], nodes * along_x
 
-    distance = stage(go, lambda cells: distances(cells, kernel, shape), cells)
-    return stage(go, expand, distance, *stage(go, brought, distance, *chunk))
+    def windows(along, steep, constant, slope, impulse):
+        weights = along[:, 0], along[:, 1], steep[:, 0]
+        return sum(w[:, :, None] * values[:, None] for w, values in zip(weights, (constant, slope, impulse)))
+
+    polynomial, impulses, (along, *others) = stage(go, bring, at.distance, *chunk)
+    rows = stage(go, planes, at.plane, *others, polynomial, impulses)
+    flat = [nodes.reshape(len(nodes), -1) for nodes in rows]
+    return stage(go, windows, at.along, along, *flat).reshape(*at.rows.shape, -1)
 
 
-def _take(setting, shape, bodies, law, go, windows, state, shared):
+def _take(setting, shape, bodies, law, go, at, windows, state, shared):
     """A chunk after the step, and its tally, as `substep._take`."""
     (dt, dx, parameters), kernel = shared, setting.kernel
 
-    def moments(windows, distance):
-        v, first = transfers._moments(kernel, windows, distance)
-        weights, steep = (transfers._by_axis(f(distance)) for f in (kernel.weights, kernel.slopes))
-        _, *gradient = transfers._sums(windows, weights, steep)
-        return v, kernel.inverse_inertia * first, jnp.stack(gradient, 1)
+    def gradients(planes, steep_planes, plane, by_y, by_z):
+        pairs = (plane, steep_planes), (by_y, planes), (by_z, planes)
+        return tuple((w[:, :, None] * u[:, 0].reshape(*w.shape, -1)).sum(1) for w, u in pairs)
 
-    def respond(state, v, affine, gradient, dt, dx, parameters):
-        return substep._respond(law, state, v, gradient, dt, dx, parameters)._replace(C=by_row(affine / dx))
+    def respond(state, moments, gradient, dt, dx, parameters):
+        v, affine = transfers.apic(kernel, at.distance, moments)
+        gradient = jnp.stack([rows.T[:3] for rows in gradient], 1)
+        return substep._respond(law, state, v, gradient, dt, dx, parameters)._replace(C=affine / dx)
 
-    distance = stage(go, lambda cells: distances(cells, kernel, shape), state.cells)
-    new = stage(go, respond, state, *stage(go, moments, windows, distance), dt, dx, parameters)
+    along, *others = stage(go, partial(transfers._steep, kernel), at.distance)
+    planes = transfers._over_x(go, at.along, windows)
+    gradient = stage(go, gradients, planes, transfers._over_x(go, along, windows), at.plane, *others)
+    moments = transfers._moments(kernel, go, planes, at.plane)
+    new = substep.in_rows(stage(go, respond, state, moments, gradient, dt, dx, parameters))
     return substep._settle(shape, bodies, go, new, state)
 
 
