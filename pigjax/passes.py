@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from pigjax.transfers import Kernel, add_windows, as_channels, stencil, take_windows
+from pigjax.transfers import Kernel, add_windows, as_channels, stage, stencil, take_windows
 
 
 class Pass(NamedTuple):
@@ -43,7 +43,7 @@ def gather_chunks(
     which has no derivative.
     """
     run = _ruled_gather if ruled else _gather
-    return run(own, go, as_channels(grid), chunks, shared, tally)
+    return run(own, go, stage(go, as_channels, grid), chunks, shared, tally)
 
 
 def _scatter(own, go, chunks, shared):

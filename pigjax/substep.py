@@ -180,13 +180,15 @@ def _give(setting, go, at, chunk, shared):
     dt, dx = shared
 
     def bring(distance, v, C, stress, mass, volume):
-        affine = dx * mass * by_component(C)
+        affine = dx * mass * C
         if setting.balance is None:
-            affine = affine - (dt * setting.kernel.inverse_inertia / dx) * volume * by_component(stress)
+            affine = affine - (dt * setting.kernel.inverse_inertia / dx) * volume * stress
         return brought(distance, mass[0], v, affine)
 
     transfer = ruled_spread if setting.ruled else spread
-    return transfer(setting.kernel, go, at, stage(go, bring, at.distance, *chunk))
+    v, C, stress, *others = chunk
+    polynomial = stage(go, bring, at.distance, v, by_component(C), by_component(stress), *others)
+    return transfer(setting.kernel, go, at, polynomial)
 
 
 def _take(setting, shape, bodies, law, go, at, windows, state, shared):
@@ -196,7 +198,7 @@ def _take(setting, shape, bodies, law, go, at, windows, state, shared):
     moments = transfer(setting.kernel, go, at, windows)
     v, per_cell = stage(go, partial(apic, setting.kernel), at.distance, moments)
     with jax.named_scope("law"):
-        new = in_rows(stage(go, partial(_respond, law), state, v, per_cell, dt, dx, parameters))
+        new = in_rows(stage(go, partial(_respond, law), by_components(state), v, per_cell, dt, dx, parameters))
     return _settle(shape, bodies, go, new, state)
 
 
@@ -231,15 +233,15 @@ def _check(shape, bodies, state, before, volume):
 
 
 def _respond(law, state, v, per_cell, dt, dx, parameters):
-    """State after the particles moved and their matter responded, tensors by component."""
+    """State after the particles moved and their matter responded; tensors [3 3 c]."""
     rate = per_cell / dx
     if state.row is not None:
         parameters = parameters_of(parameters, state.row[0])
     hardening = None if state.hardening is None else state.hardening[0]
-    F, hardening, stress = respond(law, by_component(state.F), rate, dt, hardening, parameters)
+    F, hardening, stress = respond(law, state.F, rate, dt, hardening, parameters)
     visual = state.visual
     if visual is not None:
-        visual = by_component(visual) + dt * product(rate, by_component(visual))
+        visual = visual + dt * product(rate, visual)
     way = dt / dx * v - state.rounded
     cells = state.cells + way
     return state._replace(
@@ -254,10 +256,19 @@ def _respond(law, state, v, per_cell, dt, dx, parameters):
     )
 
 
+def by_components(state: State) -> State:
+    """A state with its tensors as [3 3 c]; outside of a stage, where XLA:CPU would visit them number by number."""
+    return _reshaped(state, by_component)
+
+
 def in_rows(state: State) -> State:
-    """A state's tensors as rows; outside of a stage, where XLA:CPU would write them number by number."""
+    """Inverse of `by_components`."""
+    return _reshaped(state, by_row)
+
+
+def _reshaped(state, how):
     tensors = {"C": state.C, "F": state.F, "stress": state.stress, "visual": state.visual}
-    return state._replace(**{name: by_row(tensor) for name, tensor in tensors.items() if tensor is not None})
+    return state._replace(**{name: how(tensor) for name, tensor in tensors.items() if tensor is not None})
 
 
 def parameters_of(parameters, row):

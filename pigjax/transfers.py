@@ -177,34 +177,38 @@ def ruled_collect(kernel, go, at, windows):
     return collect(kernel, go, at, windows)
 
 
+def _collect_forward(kernel, go, at, windows):
+    planes = _over_x(go, at.along, windows)
+    return _moments(kernel, go, planes, at.plane), (go, at, windows, planes)
+
+
 def _collect_backward(kernel, residuals, cotangents):
-    go, at, windows = residuals
-    slope = _slope(kernel, go, at, windows, _over_x(go, at.along, windows), cotangents)
-    return None, slope, spread(kernel, go, at, cotangents)
+    go, at, windows, planes = residuals
+    return None, _slope(kernel, go, at, windows, planes, cotangents), spread(kernel, go, at, cotangents)
 
 
-ruled_collect.defvjp(lambda kernel, *inputs: (ruled_collect(kernel, *inputs), inputs), _collect_backward)
+ruled_collect.defvjp(_collect_forward, _collect_backward)
 
 
 def _weights(kernel, distance):
     """Weights as a stencil has them."""
-    weights = kernel.weights(distance)
+    weights = jnp.stack(kernel.weights(distance))
     return _along_x(kernel, weights), _of_plane(weights, weights)
 
 
 def _steep(kernel, distance):
     """Derivatives of the weights: along x [c 2 n], and of a plane's nodes by y and by z [c r]."""
-    weights, slopes = kernel.weights(distance), kernel.slopes(distance)
+    weights, slopes = jnp.stack(kernel.weights(distance)), jnp.stack(kernel.slopes(distance))
     return _along_x(kernel, slopes), _of_plane(slopes, weights), _of_plane(weights, slopes)
 
 
 def _along_x(kernel, weights):
-    first = [offset * w[0] for offset, w in zip(kernel.offsets, weights)]
-    return jnp.stack([jnp.stack([w[0] for w in weights], -1), jnp.stack(first, -1)], 1)
+    factors = np.stack([np.ones(len(kernel.offsets)), kernel.offsets])[:, :, None].astype(weights.dtype)
+    return jnp.moveaxis(factors * weights[:, 0], -1, 0)
 
 
 def _of_plane(along_y, along_z):
-    return jnp.stack([y[1] * z[2] for y in along_y for z in along_z], -1)
+    return (along_y[:, 1][:, None] * along_z[:, 2]).reshape(-1, along_y.shape[-1]).T
 
 
 def _in_plane(kernel, constant, slope_y, slope_z):
@@ -243,23 +247,13 @@ def _moments(kernel, go, planes, plane):
 def _slope(kernel, go, at, windows, planes, polynomial):
     """Cotangent of a stencil: Σ ∇wᵢ uᵢ·pᵢ of windows u, whose sums along x `planes` holds, and a polynomial p."""
 
-    def meet(steep_planes, planes, constant, slope_x, *others):
-        at_nodes = _in_plane(kernel, constant, *others)
+    def meet(polynomial, *moments):
+        return jnp.stack([sum(p * m for p, m in zip(polynomial, along)).T.sum(0) for along in moments])
 
-        def met(planes):
-            values = planes.reshape(-1, 2, *at_nodes.shape[1:])
-            return values[:, 0] * at_nodes + values[:, 1] * slope_x[:, None]
-
-        return met(steep_planes), met(planes)
-
-    def sums(by_x, by_others, *weights):
-        pairs = zip(weights, (by_x, by_others, by_others))
-        return tuple(sum(w[:, k, None] * u[:, k] for k in range(w.shape[1])) for w, u in pairs)
-
-    along, *others = stage(go, partial(_steep, kernel), at.distance)
-    met = stage(go, meet, _over_x(go, along, windows), planes, *polynomial)
-    rows = stage(go, sums, *met, at.plane, *others)
-    slope = stage(go, lambda *rows: jnp.stack([row.T.sum(0) for row in rows]), *rows)
+    along, by_y, by_z = stage(go, partial(_steep, kernel), at.distance)
+    by_x = _moments(kernel, go, _over_x(go, along, windows), at.plane)
+    others = (_moments(kernel, go, planes, steep) for steep in (by_y, by_z))
+    slope = stage(go, meet, polynomial, by_x, *others)
     return Stencil._make([None, slope, None, None])  # weights follow from the distance
 
 

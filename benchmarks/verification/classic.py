@@ -76,7 +76,9 @@ def _take(setting, shape, bodies, law, go, at, windows, state, shared):
     def respond(state, moments, gradient, dt, dx, parameters):
         v, affine = transfers.apic(kernel, at.distance, moments)
         gradient = jnp.stack([rows.T[:3] for rows in gradient], 1)
-        return substep._respond(law, state, v, gradient, dt, dx, parameters)._replace(C=affine / dx)
+        return substep._respond(law, substep.by_components(state), v, gradient, dt, dx, parameters)._replace(
+            C=affine / dx
+        )
 
     along, *others = stage(go, partial(transfers._steep, kernel), at.distance)
     planes = transfers._over_x(go, at.along, windows)
