@@ -67,6 +67,23 @@ def timed(run, *, windows=5):
     return first, statistics.median(times), result
 
 
+def timed_in_turn(*runs, windows=21):
+    """Seconds of first calls, medians of warm ones taken in turn, and the median ratio of the last run to the first."""
+    first, times = [], []
+    for run in runs:
+        begun = time.perf_counter()
+        jax.block_until_ready(run())
+        first.append(time.perf_counter() - begun)
+    for _ in range(windows):
+        row = []
+        for run in runs:
+            begun = time.perf_counter()
+            jax.block_until_ready(run())
+            row.append(time.perf_counter() - begun)
+        times.append(row)
+    return first, np.median(times, 0), statistics.median(row[-1] / row[0] for row in times)
+
+
 def ours(law, count, nodes, *, steps=40, domain=None, colliders=(), contact=None, **config):
     """Compile seconds, seconds per substep, end and health."""
     particles, grid, table = scene(law, count, nodes, domain=domain)
@@ -184,10 +201,10 @@ def gradient(arguments):
             return end.x[:, 1].mean()
 
         alone, both = jax.jit(height), jax.jit(jax.value_and_grad(height))
-        _, forward, _ = timed(lambda f=alone: f(particles.v, particles, table), windows=9)
-        first, seconds, _ = timed(lambda f=both: f(particles.v, particles, table), windows=9)
+        runs = [partial(function, particles.v, particles, table) for function in (alone, both)]
+        (_, first), (forward, seconds), ratio = timed_in_turn(*runs)
         print(
-            f"| pigjax | {steps} | {steps / forward:.1f} | {steps / seconds:.1f} | {seconds / forward:.2f} |"
+            f"| pigjax | {steps} | {steps / forward:.1f} | {steps / seconds:.1f} | {ratio:.2f} |"
             f" {first - seconds:.1f} |",
             flush=True,
         )
