@@ -113,6 +113,12 @@ def _first_invariant(b: Tensors, J: Scalars) -> Scalars:
         return y - ((y * y - 2 * tr) * y * y - 8 * J * y + constant) / jnp.where(slope > 0, slope, jnp.inf)
 
     fixed = jax.tree.map(lax.stop_gradient, coefficients)
-    # A loop, where an unrolled iteration would be computed anew by XLA for each of its many uses.
-    y = lax.fori_loop(0, _NEWTON_STEPS - 2, lambda _, y: newton(y, *fixed), jnp.sqrt(3 * fixed[0]))
+
+    def half_of_them(_, y):
+        for _ in range((_NEWTON_STEPS - 2) // 2):
+            y = newton(y, *fixed)
+        return y
+
+    # A loop, where what is unrolled would be computed anew by XLA for each of its many uses; of few rounds, which cost.
+    y = lax.fori_loop(0, 2, half_of_them, jnp.sqrt(3 * fixed[0]))
     return newton(newton(y, *coefficients), *coefficients)
