@@ -25,7 +25,7 @@ from pigjax.matter import Grid, Health, Particles, SimConfig, StepHealth, Trajec
 from pigjax.sleep import Sleep, Sleeper
 
 __all__ = ["SimConfig", "choose_integrator", "choose_substeps", "rollout", "stable_dt", "step"]
-_COST_OF_IMPLICIT = 350  # explicit steps in the time of an implicit one, by benchmarks/bench_implicit.py
+_COST_OF_IMPLICIT = 400  # explicit steps in the time of an implicit one, by benchmarks/bench_implicit.py
 Vector = Float[Array, "3"] | Sequence[float | int] | np.ndarray
 
 
