@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from _profile import seconds_by_scope
 from _timing import machine, use_host_devices
+from tradeoff.points import in_turn
 
 from pigjax.boxes import Fit, whole
 from pigjax.colliders import Plane
@@ -65,23 +66,6 @@ def timed(run, *, windows=5):
         jax.block_until_ready(run())
         times.append(time.perf_counter() - begun)
     return first, statistics.median(times), result
-
-
-def timed_in_turn(*runs, windows=21):
-    """Seconds of first calls, medians of warm ones taken in turn, and the median ratio of the last run to the first."""
-    first, times = [], []
-    for run in runs:
-        begun = time.perf_counter()
-        jax.block_until_ready(run())
-        first.append(time.perf_counter() - begun)
-    for _ in range(windows):
-        row = []
-        for run in runs:
-            begun = time.perf_counter()
-            jax.block_until_ready(run())
-            row.append(time.perf_counter() - begun)
-        times.append(row)
-    return first, np.median(times, 0), statistics.median(row[-1] / row[0] for row in times)
 
 
 def ours(law, count, nodes, *, steps=40, domain=None, colliders=(), contact=None, **config):
@@ -201,11 +185,12 @@ def gradient(arguments):
             return end.x[:, 1].mean()
 
         alone, both = jax.jit(height), jax.jit(jax.value_and_grad(height))
-        runs = [partial(function, particles.v, particles, table) for function in (alone, both)]
-        (_, first), (forward, seconds), ratio = timed_in_turn(*runs)
+        runs = {function: partial(function, particles.v, particles, table) for function in (alone, both)}
+        found = in_turn(runs, windows=21)
+        forward, seconds = found[alone].seconds, found[both].seconds
         print(
-            f"| pigjax | {steps} | {steps / forward:.1f} | {steps / seconds:.1f} | {ratio:.2f} |"
-            f" {first - seconds:.1f} |",
+            f"| pigjax | {steps} | {steps / forward:.1f} | {steps / seconds:.1f} | {seconds / forward:.2f} |"
+            f" {found[both].compile_seconds:.1f} |",
             flush=True,
         )
     for engine in ("taichi", "warp") if arguments.rivals else ():

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from pigjax.transfers import Kernel, add_windows, as_channels, stage, stencil, take_windows
+from pigjax.transfers import CHANNELS, Kernel, add_windows, as_channels, stage, stencil, take_windows
 
 
 class Pass(NamedTuple):
@@ -52,7 +52,7 @@ def _scatter(own, go, chunks, shared):
         at = _stencil(own, go, cells)
         return add_windows(grid, at, own.function(go, at, chunk, shared))
 
-    return lax.fori_loop(0, len(chunks[0]), visit, jnp.zeros((*own.shape, 4), chunks[0].dtype))
+    return lax.fori_loop(0, len(chunks[0]), visit, jnp.zeros((*own.shape, CHANNELS), chunks[0].dtype))
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))

@@ -20,8 +20,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.errors import InputError
 
-Rows: TypeAlias = Float[Array, "c 4"]
-Moments: TypeAlias = tuple[Rows, Rows, Rows, Rows]
+Numbers: TypeAlias = Float[Array, "c 4"]
+Moments: TypeAlias = tuple[Numbers, Numbers, Numbers, Numbers]
 Windows: TypeAlias = Float[Array, "c r k"]
 CHANNELS = 4  # numbers of a node: mass and momentum, or velocity and a zero; they fill a machine vector
 

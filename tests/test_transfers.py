@@ -74,8 +74,7 @@ def test_particles_get_the_weighted_sums_of_their_nodes(numbers, kernel):
 
 
 @kernels
-def test_apic_gives_back_what_a_particle_of_its_own_brought(x64, kernel):
-    # an affine field, sampled at the nodes, is read without loss
+def test_apic_reads_an_affine_field_without_loss(x64, kernel):
     cells, rate, v = jnp.asarray([[3.2], [4.7], [2.9]]), np.arange(9.0).reshape(3, 3) - 3, np.array([1.0, -2, 0.5])
     points = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), -1) - np.asarray(cells)[:, 0]
     at = stencil(GO, cells, kernel, SHAPE)
