@@ -213,8 +213,13 @@ def _of_plane(along_y, along_z):
 
 def _in_plane(kernel, constant, slope_y, slope_z):
     """A polynomial at the nodes of a plane [c r 4]."""
-    y, z = np.stack(np.meshgrid(kernel.offsets, kernel.offsets, indexing="ij")).reshape(2, -1, 1).astype(constant.dtype)
+    y, z = _plane_offsets(kernel, constant.dtype)[:, :, None]
     return constant[:, None] + slope_y[:, None] * y + slope_z[:, None] * z
+
+
+def _plane_offsets(kernel, dtype):
+    """Offsets along y, and along z, of a plane's nodes [2 r]."""
+    return np.stack(np.meshgrid(kernel.offsets, kernel.offsets, indexing="ij")).reshape(2, -1).astype(dtype)
 
 
 def _over_x(go, along, windows):
@@ -229,17 +234,15 @@ def _over_x(go, along, windows):
 
 def _moments(kernel, go, planes, plane):
     """What `collect` finds, from sums along x."""
-    nodes = [(y, z) for y in kernel.offsets for z in kernel.offsets]
+    y, z = _plane_offsets(kernel, plane.dtype)
 
     def sums(planes, plane):
-        planes = planes.reshape(*planes.shape[:2], len(nodes), CHANNELS)
+        still, sloped = jnp.moveaxis(planes.reshape(len(plane), 2, -1, CHANNELS), 1, 0)
 
-        def total(values, factors):
-            return sum(f * plane[:, k, None] * values[:, k] for k, f in enumerate(factors) if f)
+        def total(nodes, weights):  # XLA:CPU adds with vectors in a reduction, and not in a sum that is written out
+            return (weights[:, :, None] * nodes).sum(1)
 
-        ones = [1] * len(nodes)
-        by_offset = (total(planes[:, 0], offsets) for offsets in zip(*nodes))
-        return total(planes[:, 0], ones), total(planes[:, 1], ones), *by_offset
+        return total(still, plane), total(sloped, plane), total(still, plane * y), total(still, plane * z)
 
     return stage(go, sums, planes, plane)
 
