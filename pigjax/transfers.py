@@ -250,13 +250,15 @@ def _moments(kernel, go, planes, plane):
 def _slope(kernel, go, at, windows, planes, polynomial):
     """Cotangent of a stencil: Σ ∇wᵢ uᵢ·pᵢ of windows u, whose sums along x `planes` holds, and a polynomial p."""
 
-    def meet(polynomial, *moments):
-        return jnp.stack([sum(p * m for p, m in zip(polynomial, along)).T.sum(0) for along in moments])
+    def met(planes, plane, constant, slope_x, *others):
+        still, sloped = jnp.moveaxis(planes.reshape(len(plane), 2, -1, CHANNELS), 1, 0)
+        nodes = still * _in_plane(kernel, constant, *others) + sloped * slope_x[:, None]
+        return (plane[:, :, None] * nodes).sum(1)
 
     along, by_y, by_z = stage(go, partial(_steep, kernel), at.distance)
-    by_x = _moments(kernel, go, _over_x(go, along, windows), at.plane)
-    others = (_moments(kernel, go, planes, steep) for steep in (by_y, by_z))
-    slope = stage(go, meet, polynomial, by_x, *others)
+    pairs = (_over_x(go, along, windows), at.plane), (planes, by_y), (planes, by_z)
+    parts = [stage(go, met, *pair, *polynomial) for pair in pairs]
+    slope = stage(go, lambda *parts: jnp.stack([part.T.sum(0) for part in parts]), *parts)
     return Stencil._make([None, slope, None, None])  # weights follow from the distance
 
 
