@@ -164,8 +164,8 @@ def ruled_spread(kernel, go, at, polynomial):
 
 def _spread_backward(kernel, residuals, cotangent):
     go, at, polynomial = residuals
-    planes = _over_x(go, at.along, cotangent)
-    return None, _slope(kernel, go, at, cotangent, planes, polynomial), _moments(kernel, go, planes, at.plane)
+    read = _read(kernel, go, at, cotangent)
+    return None, _slope(kernel, go, at, read, polynomial), _moments(kernel, go, read.planes, at.plane)
 
 
 ruled_spread.defvjp(lambda kernel, *inputs: (ruled_spread(kernel, *inputs), inputs), _spread_backward)
@@ -178,28 +178,40 @@ def ruled_collect(kernel, go, at, windows):
 
 
 def _collect_forward(kernel, go, at, windows):
-    planes = _over_x(go, at.along, windows)
-    return _moments(kernel, go, planes, at.plane), (go, at, windows, planes)
+    read = _read(kernel, go, at, windows)
+    return _moments(kernel, go, read.planes, at.plane), (go, at, read)
 
 
 def _collect_backward(kernel, residuals, cotangents):
-    go, at, windows, planes = residuals
-    return None, _slope(kernel, go, at, windows, planes, cotangents), spread(kernel, go, at, cotangents)
+    go, at, read = residuals
+    return None, _slope(kernel, go, at, read, cotangents), spread(kernel, go, at, cotangents)
 
 
 ruled_collect.defvjp(_collect_forward, _collect_backward)
+
+
+class _Read(NamedTuple):
+    """What both moments and slopes need of windows."""
+
+    planes: Float[Array, "c 4 k"]  # sums along x by weights, those times offsets, and the derivatives of both
+    by_y: Float[Array, "c r"]  # derivatives of the weights of a plane's nodes
+    by_z: Float[Array, "c r"]
+
+
+def _read(kernel, go, at, windows):
+    def steep(distance):
+        weights, slopes = jnp.stack(kernel.weights(distance)), jnp.stack(kernel.slopes(distance))
+        along = jnp.concatenate([_along_x(kernel, weights), _along_x(kernel, slopes)], 1)
+        return along, _of_plane(slopes, weights), _of_plane(weights, slopes)
+
+    along, *others = stage(go, steep, at.distance)
+    return _Read(_over_x(go, along, windows), *others)
 
 
 def _weights(kernel, distance):
     """Weights as a stencil has them."""
     weights = jnp.stack(kernel.weights(distance))
     return _along_x(kernel, weights), _of_plane(weights, weights)
-
-
-def _steep(kernel, distance):
-    """Derivatives of the weights: along x [c 2 n], and of a plane's nodes by y and by z [c r]."""
-    weights, slopes = jnp.stack(kernel.weights(distance)), jnp.stack(kernel.slopes(distance))
-    return _along_x(kernel, slopes), _of_plane(slopes, weights), _of_plane(weights, slopes)
 
 
 def _along_x(kernel, weights):
@@ -223,7 +235,7 @@ def _plane_offsets(kernel, dtype):
 
 
 def _over_x(go, along, windows):
-    """Sums of windows along x, by weights and by weights times offsets `along` [c 2 n]: [c 2 4 r]."""
+    """Sums of windows along x, by several weights `along` [c m n]: [c m k]."""
 
     def sums(along, windows):
         planes = windows.reshape(*along[:, 0].shape, -1)
@@ -237,29 +249,36 @@ def _moments(kernel, go, planes, plane):
     y, z = _plane_offsets(kernel, plane.dtype)
 
     def sums(planes, plane):
-        still, sloped = jnp.moveaxis(planes.reshape(len(plane), 2, -1, CHANNELS), 1, 0)
+        even, uneven = _nodes(planes[:, 0]), _nodes(planes[:, 1])
 
         def total(nodes, weights):  # XLA:CPU adds with vectors in a reduction, and not in a sum that is written out
             return (weights[:, :, None] * nodes).sum(1)
 
-        return total(still, plane), total(sloped, plane), total(still, plane * y), total(still, plane * z)
+        return total(even, plane), total(uneven, plane), total(even, plane * y), total(even, plane * z)
 
     return stage(go, sums, planes, plane)
 
 
-def _slope(kernel, go, at, windows, planes, polynomial):
-    """Cotangent of a stencil: Σ ∇wᵢ uᵢ·pᵢ of windows u, whose sums along x `planes` holds, and a polynomial p."""
+def _slope(kernel, go, at, read, polynomial):
+    """Cotangent of a stencil: Σ ∇wᵢ uᵢ·pᵢ of windows u that were read, and a polynomial p."""
 
-    def met(planes, plane, constant, slope_x, *others):
-        still, sloped = jnp.moveaxis(planes.reshape(len(plane), 2, -1, CHANNELS), 1, 0)
-        nodes = still * _in_plane(kernel, constant, *others) + sloped * slope_x[:, None]
-        return (plane[:, :, None] * nodes).sum(1)
+    def meet(plane, read, polynomial):
+        constant, slope_x, *others = polynomial
+        even, uneven = _in_plane(kernel, constant, *others), slope_x[:, None]
 
-    along, by_y, by_z = stage(go, partial(_steep, kernel), at.distance)
-    pairs = (_over_x(go, along, windows), at.plane), (planes, by_y), (planes, by_z)
-    parts = [stage(go, met, *pair, *polynomial) for pair in pairs]
-    slope = stage(go, lambda *parts: jnp.stack([part.T.sum(0) for part in parts]), *parts)
+        def met(k, weights):
+            nodes = _nodes(read.planes[:, k]) * even + _nodes(read.planes[:, k + 1]) * uneven
+            return (weights[:, :, None] * nodes).sum(1)
+
+        return met(2, plane), met(0, read.by_y), met(0, read.by_z)
+
+    parts = stage(go, meet, at.plane, read, polynomial)
+    slope = stage(go, lambda parts: jnp.stack([part.T.sum(0) for part in parts]), parts)
     return Stencil._make([None, slope, None, None])  # weights follow from the distance
+
+
+def _nodes(plane):
+    return plane.reshape(len(plane), -1, CHANNELS)
 
 
 def as_channels(nodes: Float[Array, "*n k"]) -> Float[Array, "*n 4"]:
