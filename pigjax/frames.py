@@ -33,7 +33,8 @@ from pigjax.matter import (
     to_chunks,
     to_rows,
 )
-from pigjax.substep import Scene, Setting, Watch, advance, touched_nodes
+from pigjax.rewind import Steps, run_steps
+from pigjax.substep import Scene, Setting, Watch, advance, from_grid, to_grid, touched_nodes
 from pigjax.transfers import KERNELS
 
 _AXIS = "particles"
@@ -106,7 +107,7 @@ def run_frames(
         fillers=sum(-len(part) % devices for part, moves in zip(grouping.parts, grouping.moves) if moves),
     )
     nothing = Watch(perfect_health(dtype), jnp.zeros((3, 2), bool))
-    run = partial(_frames, setting, config, frames, substeps, _block_length(substeps, of or frames))
+    run = partial(_frames, setting, config, frames, substeps, of or frames)
     if devices > 1:
         whole, shared = PartitionSpec(), PartitionSpec(_AXIS)
         mesh = Mesh(np.array(jax.local_devices()[:devices]), (_AXIS,))
@@ -124,23 +125,17 @@ def run_frames(
     return grouping.particles(states, grid), grouping.path(paths, grid, frames), health, met
 
 
-def _frames(setting, config, frames, substeps, block, scene, states, start, nothing):
+def _frames(setting, config, frames, substeps, of, scene, states, start, nothing):
     """Frames of substeps on this device's share of the particles."""
     counts = [len(state.cells) for state in states]
-
-    def substep(carry, _):
-        states, watch, steps = carry
-        states, own = advance(setting, scene, states, start + steps * scene.dt, nothing)
-        return (states, watch.worse(own), steps + 1), None
-
-    @partial(jax.checkpoint, prevent_cse=False)
-    def steps_of_block(carry, _):
-        return lax.scan(substep, carry, None, length=block)
+    simple = not setting.ruled or setting.balance is not None
+    steps_of_frame = _plain_steps if simple else _rewindable_steps
 
     def frame(carry, _):
         states, worst, steps, stopped = carry
         chunks = tuple(to_chunks(state, config.chunk) for state in states)
-        (chunks, watch, steps), _ = lax.scan(steps_of_block, (chunks, nothing, steps), None, length=substeps // block)
+        chunks, watch = steps_of_frame(setting, substeps, of, (scene, start, nothing), chunks, steps)
+        steps = steps + substeps
         moved = tuple(
             bound_visual(to_rows(chunk, count), config.visual_stretch) for chunk, count in zip(chunks, counts)
         )
@@ -157,6 +152,54 @@ def _frames(setting, config, frames, substeps, block, scene, states, start, noth
     first_bad = jnp.where(bad.any(), jnp.argmax(bad), -1)
     health = Health(**vars(worst.health), substeps=jnp.asarray(substeps), first_bad_frame=first_bad)
     return states, paths, (health, worst.met)
+
+
+def _rewindable_steps(setting, substeps, frames, shared, states, first):
+    """Steps of a frame, of which `first` is the number of the first one, with the reverse-mode rule of `rewind`."""
+
+    def begin(shared, states):
+        return to_grid(setting, shared[0], states)
+
+    def end(shared, states, nodes, number):
+        scene, start, nothing = shared
+        return from_grid(setting, scene, states, nodes, start + number * scene.dt, nothing)
+
+    fixed = [{name for name in _FIXED if getattr(state, name) is not None} for state in states]
+    passive = tuple(
+        jax.tree.map(lambda _: False, state)._replace(**dict.fromkeys(names, True))
+        for state, names in zip(states, fixed)
+    )
+    # The more steps a block has, the fewer are computed anew, and the more states are held: √2 times the fewest.
+    block = min(substeps, math.isqrt(2 * frames * substeps))
+    steps = Steps(begin, end, substeps, block, keep=frames == 1, passive=passive)
+    after, watch = run_steps(steps, shared, states, first, shared[-1])
+    return tuple(
+        new._replace(**{name: jnp.where(new.volume > 0, getattr(old, name), 0) for name in names})
+        for old, new, names in zip(states, after, fixed)
+    ), watch
+
+
+_FIXED = ("mass", "volume", "row")  # no step changes them, but to zero where a particle is no longer finite
+
+
+def _plain_steps(setting, substeps, frames, shared, states, first):
+    """The same for forward mode, and for implicit steps, none of which a reverse-mode rule should solve again."""
+    scene, start, nothing = shared
+
+    def substep(carry, _):
+        states, watch, number = carry
+        states, own = advance(setting, scene, states, start + number * scene.dt, nothing)
+        return (states, watch.worse(own), number + 1), None
+
+    most = math.isqrt(frames * substeps)
+    block = next(n for n in range(min(substeps, most), 0, -1) if substeps % n == 0)
+
+    @partial(jax.checkpoint, prevent_cse=False)
+    def steps_of_block(carry, _):
+        return lax.scan(substep, carry, None, length=block)
+
+    (states, watch, _), _ = lax.scan(steps_of_block, (states, nothing, first), None, length=substeps // block)
+    return states, watch
 
 
 def _counted(setting, watch, states):
@@ -180,12 +223,6 @@ def _specific_volume(particles, bodies):
         jax.ops.segment_sum(values, particles.body, bodies) for values in (particles.volume0, particles.mass)
     )
     return volume / jnp.where(mass > 0, mass, 1.0)
-
-
-def _block_length(substeps, frames):
-    """Largest divisor of the substeps of a frame that is not above the root of all substeps."""
-    most = math.isqrt(frames * substeps)
-    return next(n for n in range(min(substeps, most), 0, -1) if substeps % n == 0)
 
 
 def _take(state, order, axis=0):

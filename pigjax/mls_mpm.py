@@ -135,8 +135,8 @@ def rollout(
 
     Called with known numbers it visits only the part of the grid that matter is in. Inside jit, grad and vmap the whole
     grid is held, or a box of `config.box` nodes of it that moves with matter: give one that `fit_grid` has fitted.
-    Reverse mode holds one state of the particles per block of about √(frames · substeps) steps and recomputes within;
-    with a box it also keeps what each frame was set up with.
+    Reverse mode holds states in number about the root of all steps and computes the others anew, see `rewind`; with a
+    box it also keeps what each frame was set up with.
     With `sleep`, bodies at rest are left out until something comes near them (outside of jit, grad and vmap only, since
     it is decided between frames).
 

@@ -21,6 +21,7 @@ from pigjax.matter import WALL, Grid, State, StepHealth
 from pigjax.matter.groups import by_component, by_row
 from pigjax.passes import Pass, gather_chunks, scatter_chunks
 from pigjax.transfers import (
+    CHANNELS,
     Kernel,
     apic,
     brought,
@@ -134,9 +135,34 @@ def _no_tally(like: Float[Array, "_ c"]) -> Tally:
 def advance(
     setting: Setting, scene: Scene, states: tuple[State, ...], time: Array, nothing: Watch
 ) -> tuple[tuple[State, ...], Watch]:
-    """One step of all groups. Its stages bear names in a profile."""
+    """One step of all groups."""
+    return from_grid(setting, scene, states, to_grid(setting, scene, states), time, nothing)
+
+
+def to_grid(setting: Setting, scene: Scene, states: tuple[State, ...]) -> Float[Array, "x y z 4"]:
+    """First half of a step: mass and momentum of the nodes, with the impulse of the present stress in explicit steps.
+
+    Stages of a step bear names in a profile.
+    """
     with jax.named_scope("to_grid"):
-        nodes = _to_grid(setting, scene, states)
+        give = Pass(partial(_give, setting), setting.kernel, scene.nodes)
+        shared = (scene.dt, scene.grid.dx)
+        total = jnp.zeros((*scene.nodes, CHANNELS), scene.dt.dtype)
+        for state in states:
+            given = (state.v, state.C, state.stress, state.mass, state.volume)
+            total = total + scatter_chunks(give, scene.go, state.cells, given, shared, ruled=setting.ruled)
+        return total if setting.axis is None else lax.psum(total, setting.axis)
+
+
+def from_grid(
+    setting: Setting,
+    scene: Scene,
+    states: tuple[State, ...],
+    nodes: Float[Array, "x y z 4"],
+    time: Array,
+    nothing: Watch,
+) -> tuple[tuple[State, ...], Watch]:
+    """Second half of a step, begun at a time [s]: the grid's update, and back to the particles."""
     with jax.named_scope("on_grid"):
         velocity, converged = _on_grid(setting, scene, states, nodes, time)
     watch, moved = eqx.tree_at(lambda w: w.health.unconverged, nothing, jnp.asarray(converged) ^ True), []
@@ -162,17 +188,6 @@ def _on_grid(setting, scene, states, nodes, time):
     # computed anew in reverse mode, which would keep six grids of each step in between
     velocities = jax.checkpoint(lambda nodes: limit(free_velocity(scene, nodes)[1]), prevent_cse=False)
     return velocities(nodes), True
-
-
-def _to_grid(setting, scene, states):
-    """Mass and momentum of the nodes [nx ny nz 4], with the impulse of the present stress in explicit steps."""
-    give = Pass(partial(_give, setting), setting.kernel, scene.nodes)
-    shared = (scene.dt, scene.grid.dx)
-    total = jnp.zeros((*scene.nodes, 4), scene.dt.dtype)
-    for state in states:
-        given = (state.v, state.C, state.stress, state.mass, state.volume)
-        total = total + scatter_chunks(give, scene.go, state.cells, given, shared, ruled=setting.ruled)
-    return total if setting.axis is None else lax.psum(total, setting.axis)
 
 
 def _give(setting, go, at, chunk, shared):
@@ -308,7 +323,7 @@ def _part_bodies(setting, scene, states, nodes, velocity):
         place = state.cells - jnp.floor(state.cells[:, :1] / width) * width * along
         return state._replace(v=place, C=0 * state.C, stress=0 * state.stress)
 
-    moment = _to_grid(setting, scene, [moments(state) for state in states])
+    moment = to_grid(setting, scene, tuple(map(moments, states)))
     apart = (scene.bodies, *scene.grid.shape, 4)
     mass = nodes.reshape(apart)[..., :1]
     specific = scene.specific_volume[:, None, None, None, None]

@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parents[1] / "pigjax"
 
 # every module may import what stands on a lower floor only
 FLOORS = [
-    {"errors", "arrays"},
+    {"errors", "arrays", "rewind"},
     {"linalg", "krylov", "metrics", "lists"},
     {"camera", "materials", "bands", "footprints"},
     {"chunks"},
@@ -48,6 +48,7 @@ MATTER = {
     "tangents",
     "substep",
     "passes",
+    "rewind",
     "transfers",
     "materials",
     "colliders",
