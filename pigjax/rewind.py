@@ -1,7 +1,8 @@
 """Steps in a row with a reverse-mode rule that keeps few states: blocks are computed anew, and rewound step by step.
 
 Kept are the states at the beginnings of blocks, and those within one block at a time. A step is taken in two halves,
-and what lies between them is kept beside each state, so that to rewind a step neither half is computed anew.
+and what lies between them is kept beside the states of a block, so that to rewind a step neither half is computed anew;
+at the beginnings of blocks only where it is the smaller of both.
 """
 
 from __future__ import annotations
@@ -70,19 +71,20 @@ def _forward(steps, *inputs):
         return (state, tally, kept), _at(kept, 0)
 
     (state, tally, kept), (states, betweens) = lax.scan(block, (state, tally, kept), steps.bounds)
-    beginnings = eqx.partition(states, moving), betweens
+    beginnings = eqx.partition(states, moving), betweens if _bytes(betweens) <= _bytes(states) else None
     return (state, tally), (smooth, rest, first, beginnings, kept if steps.keep else None)
 
 
 def _backward(steps, residuals, cotangents):
     smooth, rest, first, ((movings, stills), betweens), kept = residuals
-    shared, beginnings = eqx.combine(smooth, rest), (eqx.combine(movings, stills), betweens)
+    shared, beginnings = eqx.combine(smooth, rest), eqx.combine(movings, stills)
     moving = jax.tree.map(lambda leaf: leaf is not None, movings, is_leaf=lambda leaf: leaf is None)
     last = len(steps.bounds) - 1
 
     def again(number, low, high, kept):
         """States of a block computed anew."""
-        beginning = _at(beginnings, number)
+        state = _at(beginnings, number)
+        between = steps.begin(shared, state) if betweens is None else _at(betweens, number)
 
         def visit(i, carry):
             state, between, kept = carry
@@ -90,7 +92,7 @@ def _backward(steps, residuals, cotangents):
             between = steps.begin(shared, state)
             return state, between, _put(kept, i - low, (state, between))
 
-        return lax.fori_loop(low + 1, high, visit, (*beginning, _put(kept, 0, beginning)))[-1]
+        return lax.fori_loop(low + 1, high, visit, (state, between, _put(kept, 0, (state, between))))[-1]
 
     def rewound(step, state, between, cotangents):
         """Cotangents of what is shared and of the state, those of the state after the step being known."""
@@ -123,7 +125,7 @@ def _backward(steps, residuals, cotangents):
 
         return lax.fori_loop(0, high - low, visit, cotangents), kept
 
-    kept = kept if steps.keep else _room(steps, shared, _at(beginnings, 0)[0])
+    kept = kept if steps.keep else _room(steps, shared, _at(beginnings, 0))
     of_state = eqx.filter(jax.tree.map(_number, cotangents[0]), moving)
     cotangents = jax.tree.map(jnp.zeros_like, smooth), of_state
     (of_shared, of_state), _ = lax.fori_loop(0, last + 1, block, (cotangents, kept))
@@ -147,6 +149,10 @@ def _room(steps, shared, state):
     return jax.tree.map(
         lambda like: jnp.zeros((min(steps.block, steps.length), *like.shape), like.dtype), (state, between)
     )
+
+
+def _bytes(tree):
+    return sum(leaf.nbytes for leaf in jax.tree.leaves(tree))
 
 
 def _at(rows, i):

@@ -25,14 +25,20 @@ def begin(shared, state):
     return jnp.sin(state["x"]) * shared["gain"]
 
 
+def wide_begin(shared, state):
+    """What lies between is then larger than the state, and not kept at the beginnings of blocks."""
+    return jnp.broadcast_to(begin(shared, state), (5, 2))
+
+
 def end(shared, state, between, number):
     """A step that depends on its number, on an integer, and on a weight that steps leave as it is."""
+    between = between.reshape(-1, 2).mean(0)
     x = state["x"] + shared["rate"] * between * state["weight"] + 0.01 * number * state["x"] + shared["count"] * 0.1
     return {"x": x, "weight": state["weight"]}, Worst(jnp.abs(x).max())
 
 
-def steps(length, block, keep):
-    return Steps(begin, end, length, block, keep, passive={"x": False, "weight": True})
+def steps(length, block, keep, wide=False):
+    return Steps(wide_begin if wide else begin, end, length, block, keep, passive={"x": False, "weight": True})
 
 
 def inputs():
@@ -60,12 +66,12 @@ def gradients(function, shared, state):
     return jax.grad(total, (0, 1))(smooth, state)
 
 
-@given(st.integers(1, 12), st.integers(1, 14), st.booleans(), st.integers(0, 5))
+@given(st.integers(1, 12), st.integers(1, 14), st.booleans(), st.booleans(), st.integers(0, 5))
 @settings(deadline=None, max_examples=12)
-def test_derivatives_and_values_are_those_of_the_steps_written_out(length, block, keep, first):
+def test_derivatives_and_values_are_those_of_the_steps_written_out(length, block, keep, wide, first):
     with jax.enable_x64(True):
         shared, state = inputs()
-        own = steps(length, min(block, length), keep)
+        own = steps(length, min(block, length), keep, wide)
         nothing, first = Worst(jnp.zeros(())), jnp.int32(first)
 
         def ours(shared, state):
@@ -92,14 +98,17 @@ def test_derivatives_survive_vmap(x64):
     jax.tree.map(lambda all, *each: np.testing.assert_allclose(all, np.stack(each), rtol=1e-12), together, *apart)
 
 
-@pytest.mark.parametrize(("keep", "anew"), [(True, 4), (False, 7)])
-def test_what_is_kept_is_not_computed_anew(x64, keep, anew):
-    """Ten steps in blocks of 4, the first of 2: of each block all but its beginning, of the last one nothing."""
+@pytest.mark.parametrize(("keep", "wide", "anew"), [(True, 0, 4), (False, 0, 7), (True, 1, 7), (False, 1, 10)])
+def test_what_is_kept_is_not_computed_anew(x64, keep, wide, anew):
+    """Ten steps in blocks of 4, the first of 2: of each block all but its beginning, of the last one nothing.
+
+    What is wide is computed anew at the beginnings too.
+    """
     seen = []
 
     def counted(shared, state):
         jax.debug.callback(lambda: seen.append("begin"))
-        return begin(shared, state)
+        return wide_begin(shared, state) if wide else begin(shared, state)
 
     shared, state = inputs()
     own = steps(10, 4, keep)._replace(begin=counted)
