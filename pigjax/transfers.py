@@ -199,12 +199,7 @@ class _Read(NamedTuple):
 
 
 def _read(kernel, go, at, windows):
-    def steep(distance):
-        weights, slopes = jnp.stack(kernel.weights(distance)), jnp.stack(kernel.slopes(distance))
-        along = jnp.concatenate([_along_x(kernel, weights), _along_x(kernel, slopes)], 1)
-        return along, _of_plane(slopes, weights), _of_plane(weights, slopes)
-
-    along, *others = stage(go, steep, at.distance)
+    along, *others = stage(go, partial(_steep, kernel), at.distance)
     return _Read(_over_x(go, along, windows), *others)
 
 
@@ -212,6 +207,13 @@ def _weights(kernel, distance):
     """Weights as a stencil has them."""
     weights = jnp.stack(kernel.weights(distance))
     return _along_x(kernel, weights), _of_plane(weights, weights)
+
+
+def _steep(kernel, distance):
+    """Weights along x, those times offsets, and the derivatives of both [c 4 n]; derivatives of a plane's [c r]."""
+    weights, slopes = jnp.stack(kernel.weights(distance)), jnp.stack(kernel.slopes(distance))
+    along = jnp.concatenate([_along_x(kernel, weights), _along_x(kernel, slopes)], 1)
+    return along, _of_plane(slopes, weights), _of_plane(weights, slopes)
 
 
 def _along_x(kernel, weights):

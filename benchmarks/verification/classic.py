@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import time
 from contextlib import contextmanager, nullcontext
-from functools import partial
 from unittest.mock import patch
 
 import jax
@@ -56,7 +55,7 @@ def _give(setting, go, at, chunk, shared):
         return nodes * transfers._in_plane(kernel, constant, *others) + steep, nodes * x[:, None], nodes * along_x
 
     def windows(along, steep, constant, slope, impulse):
-        weights = along[:, 0], along[:, 1], steep[:, 0]
+        weights = along[:, 0], along[:, 1], steep[:, 2]
         return sum(w[:, :, None] * values[:, None] for w, values in zip(weights, (constant, slope, impulse)))
 
     polynomial, impulses, (along, *others) = stage(go, bring, at.distance, *chunk)
@@ -69,9 +68,9 @@ def _take(setting, shape, bodies, law, go, at, windows, state, shared):
     """A chunk after the step, and its tally, as `substep._take`."""
     (dt, dx, parameters), kernel = shared, setting.kernel
 
-    def gradients(planes, steep_planes, plane, by_y, by_z):
-        pairs = (plane, steep_planes), (by_y, planes), (by_z, planes)
-        return tuple((w[:, :, None] * u[:, 0].reshape(*w.shape, -1)).sum(1) for w, u in pairs)
+    def gradients(read, plane):
+        pairs = (plane, read.planes[:, 2]), (read.by_y, read.planes[:, 0]), (read.by_z, read.planes[:, 0])
+        return tuple((w[:, :, None] * u.reshape(*w.shape, -1)).sum(1) for w, u in pairs)
 
     def respond(state, moments, gradient, dt, dx, parameters):
         v, affine = transfers.apic(kernel, at.distance, moments)
@@ -80,10 +79,9 @@ def _take(setting, shape, bodies, law, go, at, windows, state, shared):
             C=affine / dx
         )
 
-    along, *others = stage(go, partial(transfers._steep, kernel), at.distance)
-    planes = transfers._over_x(go, at.along, windows)
-    gradient = stage(go, gradients, planes, transfers._over_x(go, along, windows), at.plane, *others)
-    moments = transfers._moments(kernel, go, planes, at.plane)
+    read = transfers._read(kernel, go, at, windows)
+    gradient = stage(go, gradients, read, at.plane)
+    moments = transfers._moments(kernel, go, read.planes, at.plane)
     new = substep.in_rows(stage(go, respond, state, moments, gradient, dt, dx, parameters))
     return substep._settle(shape, bodies, go, new, state)
 
