@@ -104,10 +104,11 @@ def speed(arguments):
         for count, nodes in CASES if jax.default_backend() == "cpu" else CASES + LARGE:
             compile_seconds, _, _, health = ours(law, count, nodes, devices=1)
             rounds = np.array([rates(arguments, law, count, nodes) for _ in range(arguments.rounds)]) / 1e6
-            ratio = np.median(rounds[:, :2].max(1) / rounds[:, 2:].max(1)) if arguments.rivals else np.nan
+            mine, best = rounds[:, :2].max(1), rounds[:, 2:].max(1)
+            ratio = f"{np.median(mine / best):.2f}" if best.all() else "-"
             columns = " | ".join(f"{rate:.2f}" for rate in np.median(rounds, 0))
             print(
-                f"| {count // 1000}k/{nodes}³ | {law} | {columns} | {ratio:.2f} | {compile_seconds:.1f} |"
+                f"| {count // 1000}k/{nodes}³ | {law} | {columns} | {ratio} | {compile_seconds:.1f} |"
                 f" {'; '.join(health.problems()) or 'healthy'} |",
                 flush=True,
             )

@@ -155,7 +155,10 @@ def _frames(setting, config, frames, substeps, of, scene, states, start, nothing
 
 
 def _rewindable_steps(setting, substeps, frames, shared, states, first):
-    """Steps of a frame, of which `first` is the number of the first one, with the reverse-mode rule of `rewind`."""
+    """Steps of a frame with the reverse-mode rule of `rewind`.
+
+    `first` is the number of the first one, `frames` how many the whole simulation has.
+    """
 
     def begin(shared, states):
         return to_grid(setting, shared[0], states)
@@ -169,8 +172,10 @@ def _rewindable_steps(setting, substeps, frames, shared, states, first):
         jax.tree.map(lambda _: False, state)._replace(**dict.fromkeys(names, True))
         for state, names in zip(states, fixed)
     )
-    # The more steps a block has, the fewer are computed anew, and the more states are held: √2 times the fewest.
-    block = min(substeps, math.isqrt(2 * frames * substeps))
+    # Fewest states are held where blocks have the root of all steps. Of a single frame the last block is not computed
+    # anew, so that longer ones save time.
+    most = math.isqrt((2 if frames == 1 else 1) * frames * substeps)
+    block = -(-substeps // -(-substeps // most))
     steps = Steps(begin, end, substeps, block, keep=frames == 1, passive=passive)
     after, watch = run_steps(steps, shared, states, first, shared[-1])
     return tuple(

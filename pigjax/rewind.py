@@ -1,8 +1,7 @@
 """Steps in a row with a reverse-mode rule that keeps few states: blocks are computed anew, and rewound step by step.
 
 Kept are the states at the beginnings of blocks, and those within one block at a time. A step is taken in two halves,
-and what lies between them is kept beside the states of a block, so that to rewind a step neither half is computed anew;
-at the beginnings of blocks only where it is the smaller of both.
+and what lies between them is kept beside the states of a block, so that to rewind a step neither half is computed anew.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ class Steps(NamedTuple):
     end: Callable  # (shared, state, between, number of the step): state after the step, and its tally
     length: int
     block: int  # steps of a block; the first one has what is left
-    keep: bool  # the last block from the forward pass on, so that it is not computed anew
+    keep: bool  # the last block from the forward pass on, unless what lies between halves is larger than the state
     passive: Any  # which leaves of the state have no derivative by other leaves, nor by what is shared
 
     @property
@@ -40,7 +39,8 @@ class Steps(NamedTuple):
 def run_steps(steps: Steps, shared: Any, state: Any, first: Int[Array, ""], tally: Any) -> tuple[Any, Any]:
     """State after all steps, of which the first has a number, and the worst of `tally` and theirs.
 
-    The tally has no derivative. Reverse mode differentiates by the floating-point numbers of `shared` and `state`.
+    The tally has no derivative. Reverse mode differentiates, once, by the floating-point numbers of `shared` and
+    `state`.
     """
 
     def visit(i, carry):
@@ -54,8 +54,11 @@ def run_steps(steps: Steps, shared: Any, state: Any, first: Int[Array, ""], tall
 def _forward(steps, *inputs):
     shared, state, first, tally = jax.tree.map(lambda leaf: leaf.value, inputs)
     smooth, rest = eqx.partition(shared, jax.tree.map(_varies, inputs[0]))
-    moving = jax.tree.map(lambda leaf, passive: not passive or _varies(leaf), inputs[1], steps.passive)
-    kept = _room(steps, shared, state)
+    moving = jax.tree.map(
+        lambda leaf, passive: _varies(leaf) if passive else _is_smooth(leaf), inputs[1], steps.passive
+    )
+    room = _room(steps, shared, state)
+    keep = steps.keep and _bytes(room[1]) <= _bytes(room[0])
 
     def block(carry, bounds):
         low, high = bounds
@@ -63,28 +66,27 @@ def _forward(steps, *inputs):
         def visit(i, carry):
             state, tally, kept = carry
             between = steps.begin(shared, state)
-            kept = _put(kept, i - low, (state, between))
+            kept = _put(kept, i - low, (state, between)) if keep else None
             state, own = steps.end(shared, state, between, first + i)
             return state, tally.worse(own), kept
 
-        state, tally, kept = lax.fori_loop(low, high, visit, carry)
-        return (state, tally, kept), _at(kept, 0)
+        after = lax.fori_loop(low, high, visit, carry)
+        return after, (carry[0], _at(after[-1], 0)[1] if keep else None)
 
-    (state, tally, kept), (states, betweens) = lax.scan(block, (state, tally, kept), steps.bounds)
-    beginnings = eqx.partition(states, moving), betweens if _bytes(betweens) <= _bytes(states) else None
-    return (state, tally), (smooth, rest, first, beginnings, kept if steps.keep else None)
+    (after, tally, kept), (states, betweens) = lax.scan(block, (state, tally, room if keep else None), steps.bounds)
+    return (after, tally), (smooth, rest, first, eqx.partition(states, moving), betweens, kept)
 
 
 def _backward(steps, residuals, cotangents):
-    smooth, rest, first, ((movings, stills), betweens), kept = residuals
+    smooth, rest, first, (movings, stills), betweens, kept = residuals
     shared, beginnings = eqx.combine(smooth, rest), eqx.combine(movings, stills)
     moving = jax.tree.map(lambda leaf: leaf is not None, movings, is_leaf=lambda leaf: leaf is None)
-    last = len(steps.bounds) - 1
+    last, keep = len(steps.bounds) - 1, kept is not None
 
     def again(number, low, high, kept):
         """States of a block computed anew."""
         state = _at(beginnings, number)
-        between = steps.begin(shared, state) if betweens is None else _at(betweens, number)
+        between = _at(betweens, number) if keep else steps.begin(shared, state)
 
         def visit(i, carry):
             state, between, kept = carry
@@ -115,8 +117,7 @@ def _backward(steps, residuals, cotangents):
         cotangents, kept = carry
         number = last - i
         low, high = steps.bounds[number]
-        known = (number == last) & steps.keep
-        kept = again(number, low, jnp.where(known, low, high), kept)
+        kept = again(number, low, jnp.where((number == last) & keep, low, high), kept)
 
         def visit(j, cotangents):
             step = high - 1 - j
@@ -125,8 +126,8 @@ def _backward(steps, residuals, cotangents):
 
         return lax.fori_loop(0, high - low, visit, cotangents), kept
 
-    kept = kept if steps.keep else _room(steps, shared, _at(beginnings, 0))
-    of_state = eqx.filter(jax.tree.map(_number, cotangents[0]), moving)
+    kept = kept if keep else _room(steps, shared, _at(beginnings, 0))
+    of_state = jax.tree.map(_instantiated, eqx.filter(cotangents[0], moving, is_leaf=_is_zero))
     cotangents = jax.tree.map(jnp.zeros_like, smooth), of_state
     (of_shared, of_state), _ = lax.fori_loop(0, last + 1, block, (cotangents, kept))
     return of_shared, of_state, None, None
@@ -136,11 +137,19 @@ run_steps.defvjp(_forward, _backward, symbolic_zeros=True)
 
 
 def _varies(leaf):
-    return leaf.perturbed and eqx.is_inexact_array(leaf.value)
+    return leaf.perturbed and _is_smooth(leaf)
 
 
-def _number(cotangent):
-    return jnp.zeros(cotangent.shape, cotangent.dtype) if isinstance(cotangent, SymbolicZero) else cotangent
+def _is_smooth(leaf):
+    return jnp.issubdtype(jnp.result_type(leaf.value), jnp.inexact)
+
+
+def _instantiated(cotangent):
+    return jnp.zeros(cotangent.shape, cotangent.dtype) if _is_zero(cotangent) else cotangent
+
+
+def _is_zero(cotangent):
+    return isinstance(cotangent, SymbolicZero)
 
 
 def _room(steps, shared, state):

@@ -185,9 +185,7 @@ def _on_grid(setting, scene, states, nodes, time):
     if scene.contact is not None:
         _, velocity = free_velocity(scene, nodes)
         return limit(_part_bodies(setting, scene, states, nodes, velocity)), True
-    # computed anew in reverse mode, which would keep six grids of each step in between
-    velocities = jax.checkpoint(lambda nodes: limit(free_velocity(scene, nodes)[1]), prevent_cse=False)
-    return velocities(nodes), True
+    return limit(free_velocity(scene, nodes)[1]), True
 
 
 def _give(setting, go, at, chunk, shared):

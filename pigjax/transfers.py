@@ -193,7 +193,9 @@ ruled_collect.defvjp(_collect_forward, _collect_backward)
 class _Read(NamedTuple):
     """What both moments and slopes need of windows."""
 
-    planes: Float[Array, "c 4 k"]  # sums along x by weights, those times offsets, and the derivatives of both
+    planes: Float[
+        Array, "c 4 n"
+    ]  # sums along x, of all numbers of a plane, by weights, those times offsets, and the derivatives of both
     by_y: Float[Array, "c r"]  # derivatives of the weights of a plane's nodes
     by_z: Float[Array, "c r"]
 
@@ -237,7 +239,7 @@ def _plane_offsets(kernel, dtype):
 
 
 def _over_x(go, along, windows):
-    """Sums of windows along x, by several weights `along` [c m n]: [c m k]."""
+    """Sums of windows along x, by several weights `along` [c m n]: all numbers of a plane [c m 4r]."""
 
     def sums(along, windows):
         planes = windows.reshape(*along[:, 0].shape, -1)
