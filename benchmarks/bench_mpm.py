@@ -95,7 +95,7 @@ def rival(arguments, engine, *options):
 
 
 def speed(arguments):
-    """M particle-updates/s beside rivals, in one run; medians of rounds in which all have their turn."""
+    """M particle-updates/s beside rivals, and their ratio: medians of rounds in which all have their turn."""
     print("| case | law | ours, 1 device | ours, all | Taichi best | Warp | ours / best rival | compile s | health |")
     print("|---|---|---|---|---|---|---|---|---|")
     for law in ("fixed_corotated", "neo_hookean"):
@@ -117,7 +117,8 @@ def speed(arguments):
 def rates(arguments, law, count, nodes):
     """Particle-updates/s of ours on one and on all devices, of the best of Taichi's ways, and of Warp."""
     all_devices = jax.local_device_count()
-    mine = [count / ours(law, count, nodes, devices=devices)[1] for devices in (1, all_devices)]
+    one = count / ours(law, count, nodes, devices=1)[1]
+    mine = one, one if all_devices == 1 else count / ours(law, count, nodes, devices=all_devices)[1]
     if not arguments.rivals:
         return *mine, 0.0, 0.0
     common = ["--particles", count, "--grid", nodes, "--substeps", 20, "--windows", 5]

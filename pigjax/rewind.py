@@ -155,9 +155,7 @@ def _is_zero(cotangent):
 def _room(steps, shared, state):
     """Room for the states of a block, and for what lies between the halves of its steps."""
     between = jax.eval_shape(steps.begin, shared, state)
-    return jax.tree.map(
-        lambda like: jnp.zeros((min(steps.block, steps.length), *like.shape), like.dtype), (state, between)
-    )
+    return jax.tree.map(lambda like: jnp.zeros((steps.block, *like.shape), like.dtype), (state, between))
 
 
 def _bytes(tree):

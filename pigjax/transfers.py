@@ -193,9 +193,8 @@ ruled_collect.defvjp(_collect_forward, _collect_backward)
 class _Read(NamedTuple):
     """What both moments and slopes need of windows."""
 
-    planes: Float[
-        Array, "c 4 n"
-    ]  # sums along x, of all numbers of a plane, by weights, those times offsets, and the derivatives of both
+    # sums along x of all numbers of a plane: by weights, by those times offsets, and by the derivatives of both
+    planes: Float[Array, "c 4 n"]
     by_y: Float[Array, "c r"]  # derivatives of the weights of a plane's nodes
     by_z: Float[Array, "c r"]
 
