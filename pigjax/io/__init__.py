@@ -2,7 +2,17 @@
 
 from pigjax.io.cameras import Views, load_cameras, load_views
 from pigjax.io.datasets import LAYOUTS, Dataset, load_dataset
-from pigjax.io.files import read_json, write_json
+from pigjax.io.files import (
+    decoding,
+    output_folder,
+    read_json,
+    read_toml,
+    remove,
+    safe_name,
+    write_json,
+    write_text,
+    writing,
+)
 from pigjax.io.formats import load_gaussians
 from pigjax.io.images import contact_sheet, read_image, write_image
 from pigjax.io.masks import load_masks, save_masks
@@ -15,6 +25,7 @@ __all__ = [
     "Dataset",
     "Views",
     "contact_sheet",
+    "decoding",
     "last_state",
     "load_cameras",
     "load_dataset",
@@ -25,15 +36,21 @@ __all__ = [
     "load_pytree",
     "load_state",
     "load_views",
+    "output_folder",
     "read_image",
     "read_json",
     "read_ply",
+    "read_toml",
     "read_video",
+    "remove",
+    "safe_name",
     "save_masks",
     "save_ply",
     "save_pytree",
     "save_state",
     "write_image",
     "write_json",
+    "write_text",
     "write_video",
+    "writing",
 ]
