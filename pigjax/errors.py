@@ -9,6 +9,10 @@ class MissingFileError(InputError, FileNotFoundError):
     """A file or folder that was named does not exist."""
 
 
+class StaleError(InputError):
+    """Results on disk were made from other inputs than the present ones, so that they cannot be used again."""
+
+
 class SceneError(InputError):
     """A scene file asks for something that cannot be."""
 

@@ -1,6 +1,8 @@
 """Every test runs with jaxtyping + beartype on the whole package, and with strict JAX modes."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -13,8 +15,11 @@ os.environ.setdefault("PIGJAX_SHORT", "1")  # notebooks run in their short form
 # Compiles in half the processor time, to code that runs slower: tests, but for the slow ones, compile far more than
 # they compute. Notebooks and commands that tests start are compiled as users' are.
 QUICK = (
-    "--xla_cpu_parallel_codegen_split_count=1 --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+    "--xla_cpu_parallel_codegen_split_count=1",
+    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_backend_optimization_level=0",
 )
+ACCEPTED = "PIGJAX_TEST_XLA_FLAGS"  # tells the workers of pytest-xdist what the first process found
 
 jax.config.update("jax_numpy_rank_promotion", "allow")
 jax.config.update("jax_num_cpu_devices", 2)  # for what several devices share
@@ -24,12 +29,24 @@ def pytest_configure(config):
     """Start JAX: it reads the flags, and commands that a test starts do not see them. Those given from outside win."""
     given = os.environ.get("XLA_FLAGS")
     if config.option.markexpr == "not slow":
-        os.environ["XLA_FLAGS"] = f"{QUICK} {given or ''}"
+        if ACCEPTED not in os.environ:
+            os.environ[ACCEPTED] = " ".join(accepted_flags(QUICK))
+        os.environ["XLA_FLAGS"] = f"{os.environ[ACCEPTED]} {given or ''}"
     jax.devices()
     if given is None:
         os.environ.pop("XLA_FLAGS", None)
     else:
         os.environ["XLA_FLAGS"] = given
+
+
+def accepted_flags(flags):
+    """Those that this XLA knows: it ends the process at any other, so that a child process tries them."""
+    tried = {**os.environ, "XLA_FLAGS": " ".join(flags), "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run([sys.executable, "-c", "import jax; jax.devices()"], env=tried, capture_output=True, text=True)
+    if done.returncode == 0 or not flags:
+        return flags
+    known = tuple(flag for flag in flags if flag not in done.stderr)
+    return accepted_flags(known) if known != flags else ()
 
 
 @pytest.fixture
