@@ -21,20 +21,22 @@ console = Console(stderr=True, markup=False, emoji=False, highlight=False)
 _MOST_DEVICES = 8  # an image has too few rows of tiles for more
 
 
-def output_path(path: str | Path) -> Path:
+def output_path(path: str) -> Path:
     """What `--out` names: "~" is the home folder; an empty text, as an unset variable of a shell gives it, is refused.
 
     Raises:
         InputError: it is empty.
     """
-    if not str(path):
+    if not path:
         raise InputError("--out is empty; name where the results go, or leave the option out.")
     with suppress(RuntimeError):  # there is no home folder
         return Path(path).expanduser()
     return Path(path)
 
 
-Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.", parser=output_path, metavar="PATH")]
+Out = Annotated[
+    Path, typer.Option("--out", "-o", help="Folder for the results.", parser=str, callback=output_path, metavar="PATH")
+]
 
 
 def said(text: object, *, label: str = "", style: str = "") -> Text:

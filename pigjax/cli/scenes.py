@@ -19,7 +19,8 @@ AccuracyOption = Annotated[
 File = Annotated[
     Path,
     typer.Option(
-        "--out", "-o", help="Video (.mp4, .gif), or one picture (.png).", parser=output_path, metavar="PATH"
+        "--out", "-o", help="Video (.mp4, .gif), or one picture (.png).", parser=str,
+        callback=output_path, metavar="PATH",
     ),
 ]  # fmt: skip
 

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Integer, Num
 
-from pigjax.errors import InputError
+from pigjax.errors import InputError, MissingFileError
 from pigjax.io.archives import ArrayHeader, load_arrays, save_arrays
 from pigjax.io.files import PathLike
 
+_WHAT = "labels.npz of 'pigjax segment'"
 _REMEDY = "segment the scene again"
 
 
@@ -58,7 +59,14 @@ def load_labels(path: PathLike, count: int | None = None) -> StoredLabels:
     def check(headers: Mapping[str, ArrayHeader]) -> None:
         _check_headers(path, headers, count)
 
-    arrays = load_arrays(path, "labels.npz of 'pigjax segment'", remedy=_REMEDY, check=check)
+    try:
+        arrays = load_arrays(path, _WHAT, remedy=_REMEDY, check=check)
+    except MissingFileError:
+        raise
+    except InputError as error:
+        if error.__cause__ is None:
+            raise
+        raise InputError(f"{path}: not the {_WHAT} ({error.__cause__}); {_REMEDY}.") from error
     labels = StoredLabels(*(arrays[name] for name in StoredLabels._fields))
     lowest, highest = int(labels.object_id.min(initial=0)), int(labels.object_id.max(initial=0))
     if not -1 <= lowest <= highest < 2**31:
@@ -76,13 +84,12 @@ def _check_headers(path: PathLike, headers: Mapping[str, ArrayHeader], count: in
     kinds["confidence"] = ("f", 1, "real numbers [n]")
     missing = [name for name in kinds if name not in headers]
     if missing:
-        raise InputError(f"{path}: not the labels.npz of 'pigjax segment' (it has no {missing[0]}); {_REMEDY}.")
+        raise InputError(f"{path}: not the {_WHAT} (it has no {missing[0]}); {_REMEDY}.")
     for name, (kind, axes, wanted) in kinds.items():
         found = headers[name]
         if found.dtype.kind not in kind or len(found.shape) != axes:
             raise InputError(
-                f"{path}: {name} is {found.dtype} {list(found.shape)}, not {wanted}; it is not the labels.npz of"
-                f" 'pigjax segment', so {_REMEDY}."
+                f"{path}: not the {_WHAT} ({name} is {found.dtype} {list(found.shape)}, not {wanted}); {_REMEDY}."
             )
     rows = {name: headers[name].shape[0] for name in kinds}
     if count is not None and rows["object_id"] != count:

@@ -99,7 +99,7 @@ def _remove(gaussians: Gaussians, labels: Labels, number: int, views: io.Views, 
     io.save_ply(folder / f"{stem}.ply", rest)
     seen = contributions(gaussians, views.cameras) > _LEAST_SEEN
     holes = [np.asarray(hole_mask(gaussians, labels, number, camera, seen=seen)) for camera in views.cameras]
-    io.save_masks(folder / stem, views.names, 255 * np.stack(holes).astype(np.int32))
+    io.save_masks(folder / stem, io.safe_names(views.names), 255 * np.stack(holes).astype(np.int32))
     pictures = []
     for view in np.argsort([-hole.sum() for hole in holes], kind="stable")[:_SHEET_VIEWS]:
         after = np.clip(np.asarray(render(rest, views.cameras[int(view)]).rgb), 0, 1)
