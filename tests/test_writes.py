@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from pigjax import cli, io
-from pigjax.camera import look_at
+from pigjax.camera import look_at, stack_cameras
 from pigjax.errors import InputError
 from pigjax.overlay import comparison_sheet, legend_sheet
 from pigjax.scene import load_scene, objects, run_scene
@@ -83,20 +83,14 @@ def segmenting(monkeypatch):
     monkeypatch.setattr(objects, "hole_mask", lambda *a, **k: np.ones((4, 4), bool))
     monkeypatch.setattr(objects, "render", lambda *a, **k: type("Frame", (), {"rgb": black}))
     monkeypatch.setattr(objects, "_sheet", lambda *a: black)
-    camera = look_at((0, 0, 1), (0, 0, 0), up=(0, 1, 0), focal=4.0, width=4, height=4)
-    two = jax_stack([camera, camera])
+    camera = look_at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0), focal=4.0, width=4, height=4)
+    two = stack_cameras([camera, camera])
 
     def segment(out, names, views=("a", "b")):
         photos = io.Views(two, tuple(views), np.stack([black, black]), np.ones((2, 4, 4), np.int32), ("train",) * 2)
         return objects.segment_files(gaussians, photos, names, out, fill=False, remove=["1"])
 
     return segment
-
-
-def jax_stack(cameras):
-    from pigjax.camera import stack_cameras
-
-    return stack_cameras(cameras)
 
 
 @settings(QUICK, max_examples=15)
@@ -189,10 +183,9 @@ def commands(out):
     yield "tune", STUDY, "-o", out
 
 
-@pytest.mark.parametrize("place", ["file", "file/deeper"])
-def test_a_file_in_place_of_the_folder_is_one_line_of_every_command(command, tmp_path, place):
+def test_a_file_in_place_of_the_folder_is_one_line_of_every_command(command, tmp_path):
     (tmp_path / "file").write_text("mine")
-    for arguments in commands(tmp_path / place):
+    for arguments in [*commands(tmp_path / "file"), ("demo", "-o", tmp_path / "file" / "deeper")]:
         code, said = command(*arguments)
         last = said.splitlines()[-1]
         assert code == 2, (arguments, said)
@@ -320,19 +313,21 @@ WRITE_FOR_EVER = """
 import sys, time
 from pathlib import Path
 from pigjax import io
-with io.writing(Path(sys.argv[1]) / sys.argv[2]) as partial:
-    partial.write_bytes(bytes(1000))
+out = Path(sys.argv[1])
+with io.writing(out / "states/000013.npz") as state, io.writing(out / "video.mp4") as video:
+    state.write_bytes(bytes(1000))
+    video.write_bytes(bytes(1000))
     print("ready", flush=True)
     time.sleep(100)
 """
 
 
-def killed(code, *arguments, signals, path=(), after=0.0):
+def killed(code, *arguments, signals, cwd=None, after=0.0):
     """Start Python, send it signals once it says "ready", and give its exit code and standard error."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*path, *sys.path])}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
     process = subprocess.Popen(
         [sys.executable, "-c", "import signal; signal.signal(2, signal.default_int_handler)\n" + code, *arguments],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=cwd,
     )  # fmt: skip
     assert process.stdout.readline() == "ready\n", process.communicate()
     time.sleep(after)
@@ -343,29 +338,25 @@ def killed(code, *arguments, signals, path=(), after=0.0):
 
 
 def test_leftovers_of_killed_writers_are_swept_and_nothing_else(tmp_path):
-    mine = [".notes.2023.json", ".cache.4711", ".pigjax", ".video.mp4", "seen.1.npz"]
+    mine = [".notes.2023.json", ".cache.4711", ".pigjax", ".video.mp4", "seen.1.npz", "video.mp4"]
     for name in mine:
         (tmp_path / name).write_text("mine")
     with io.writing(tmp_path / "of_a_living_process.npz") as living:
         living.write_text("half")
-        code, _ = killed(WRITE_FOR_EVER, str(tmp_path), "states/000013.npz", signals=[signal.SIGKILL])
+        code, _ = killed(WRITE_FOR_EVER, str(tmp_path), signals=[signal.SIGKILL])
         assert code == -signal.SIGKILL
         left = [path.name for path in (tmp_path / "states").iterdir()]
         assert len(left) == 1
         assert left[0].startswith(".")
+        before = len(list(tmp_path.iterdir()))
+        io.write_text(tmp_path / "video.mp4", "the next writer sweeps what was left of its file")
+        assert len(list(tmp_path.iterdir())) == before - 1
         io.output_folder(tmp_path)
         assert list((tmp_path / "states").iterdir()) == []
         assert living.exists()
     assert sorted(path.name for path in tmp_path.iterdir() if path.is_file()) == sorted(
         [*mine, "of_a_living_process.npz"]
     )
-
-
-def test_the_next_writer_sweeps_what_a_kill_left_of_its_file(tmp_path):
-    killed(WRITE_FOR_EVER, str(tmp_path), "video.mp4", signals=[signal.SIGKILL])
-    assert len(list(tmp_path.iterdir())) == 1
-    io.write_text(tmp_path / "video.mp4", "whole")
-    assert [path.name for path in tmp_path.iterdir()] == ["video.mp4"]
 
 
 STOP_A_COMMAND = """
@@ -395,8 +386,8 @@ def test_a_command_stopped_while_libraries_load_says_its_sentence(tmp_path):
     (tmp_path / "pigjax").mkdir()
     (tmp_path / "pigjax" / "__init__.py").write_text("import time; print('ready', flush=True); time.sleep(100)")
     code = "import pigjax_command; pigjax_command.main()"
-    root = str(Path(__file__).parents[1])
-    assert killed(code, signals=[signal.SIGINT], path=[str(tmp_path), root]) == (130, SENTENCE)
+    # the working folder comes first where modules are looked for
+    assert killed(code, signals=[signal.SIGINT], cwd=tmp_path) == (130, SENTENCE)
 
 
 def test_errors_of_the_system_are_one_line(command, monkeypatch):
@@ -454,11 +445,12 @@ def test_a_damaged_archive_is_named_or_read(stored, file, load, data):
         else:
             content[at:at] = data.draw(st.binary(max_size=8))
     (stored / "damaged.npz").write_bytes(content)
+    refusal = None
     try:
         load(stored / "damaged.npz")
     except InputError as error:
-        assert "damaged.npz: " in str(error)
-        assert "\n" not in str(error)
+        refusal = str(error)
+    assert refusal is None or ("damaged.npz: " in refusal and "\n" not in refusal)
 
 
 BAD_LABELS = {
