@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from pigjax.errors import InputError
 
+_LONGEST_TEXT = 500  # letters
 _GOLDEN = 0.6180339887498949  # steps of hue that keep neighbouring ids far apart
 
 
@@ -82,7 +83,7 @@ def legend_sheet(
             if thumbnail is not None:
                 sheet.paste(thumbnail, (left + (inner - thumbnail.width) // 2, middle - thumbnail.height // 2))
             left += row_height
-        draw.text((left, middle), f"{object_id}  {name}", fill="black", font=font, anchor="lm")
+        draw.text((left, middle), _one_line(f"{object_id}  {name}"), fill="black", font=font, anchor="lm")
     return np.asarray(sheet)
 
 
@@ -119,8 +120,15 @@ def _labelled_strip(title: str, panels: Sequence[Any], height: int, width: int) 
     strip = Image.new("RGB", (max(len(panels), 1) * (width + 4), height + 24), "white")
     for i, panel in enumerate(panels):
         strip.paste(Image.fromarray(np.asarray(panel, np.uint8)), (i * (width + 4), 20))
-    ImageDraw.Draw(strip).text((2, 10), title, fill="black", font=ImageFont.load_default(size=14), anchor="lm")
+    ImageDraw.Draw(strip).text(
+        (2, 10), _one_line(title), fill="black", font=ImageFont.load_default(size=14), anchor="lm"
+    )
     return np.asarray(strip)
+
+
+def _one_line(text: str) -> str:
+    """A text of any origin as pillow draws it: one line of printable letters, none beyond the widest sheet."""
+    return "".join(letter if letter.isprintable() else " " for letter in text[:_LONGEST_TEXT])
 
 
 def _scaled(pixels: np.ndarray, width: int, height: int) -> Image.Image:

@@ -200,7 +200,6 @@ def _preview(path: Path, gaussians: Gaussians, views: io.Views, config: FitConfi
     frame = render(gaussians, views.cameras[0], config.render, background=config.background, outputs=("rgb",))
     assert frame.rgb is not None
     picture = np.clip(np.concatenate([np.asarray(views.images[0]), np.asarray(frame.rgb)], 1), 0, 1)
-    path.parent.mkdir(parents=True, exist_ok=True)
     io.write_image(path, picture)
 
 

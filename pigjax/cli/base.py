@@ -11,11 +11,49 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.text import Text
+
+from pigjax.errors import InputError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
-console = Console(stderr=True)
+# names come from files: nothing that is printed is taken for markup, a style is given by `said`
+console = Console(stderr=True, markup=False, emoji=False, highlight=False)
 _MOST_DEVICES = 8  # an image has too few rows of tiles for more
-Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")]
+
+
+def output_path(path: str) -> Path:
+    """What `--out` names: "~" is the home folder; an empty text, as an unset variable of a shell gives it, is refused.
+
+    Raises:
+        InputError: it is empty.
+    """
+    if not path:
+        raise InputError("--out is empty; name where the results go, or leave the option out.")
+    with suppress(RuntimeError):  # there is no home folder
+        return Path(path).expanduser()
+    return Path(path)
+
+
+Out = Annotated[
+    Path, typer.Option("--out", "-o", help="Folder for the results.", parser=str, callback=output_path, metavar="PATH")
+]
+
+
+def said(text: object, *, label: str = "", style: str = "") -> Text:
+    """A text as it is printed: literally, with control characters, which could steer a terminal, shown as U+FFFD.
+
+    Args:
+        text: of any origin.
+        label: printed in front, in the style.
+        style: of rich, such as "bold red".
+    """
+    plain = "".join(letter if letter.isprintable() or letter == "\n" else "\ufffd" for letter in str(text))
+    return Text.assemble((label, style), plain) if label else Text(plain)
+
+
+def row(*cells: object) -> tuple[Text, ...]:
+    """Cells of a table, printed literally."""
+    return tuple(said(cell) for cell in cells)
 
 
 def one_device_per_core() -> None:
@@ -31,7 +69,7 @@ def one_device_per_core() -> None:
 @contextmanager
 def progress(*columns: str) -> Iterator[Progress]:
     """Progress bar with time left."""
-    texts = [TextColumn(column) for column in ("{task.description:<12}", *columns)]
+    texts = [TextColumn(column, markup=False) for column in ("{task.description:<12}", *columns)]
     bar = Progress(
         texts[0], BarColumn(), MofNCompleteColumn(), *texts[1:], TimeElapsedColumn(), TimeRemainingColumn(),
         console=console,

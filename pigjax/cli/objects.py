@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 from rich.progress import TaskID
 from rich.table import Table
 
-from pigjax.cli.base import Out, app, console, one_device_per_core, progress
+from pigjax.cli.base import Out, app, console, one_device_per_core, progress, row, said
 
 TauT = Annotated[float, typer.Option(help="Transmittance that marks the surface.", min=0, max=1)]
 TauD = Annotated[float, typer.Option(help="Relative depth tolerance of a vote.", min=0, max=1)]
@@ -68,7 +67,7 @@ def reconstruct(
         seed=seed,
         render=RenderConfig(bands=jax.local_device_count()),
     )
-    out.mkdir(parents=True, exist_ok=True)
+    out = io.output_folder(out, files=("gaussians.ply", "poses.json", "report.json"), folders=("previews",))
     with progress("{task.fields[state]}") as bar:
         task, last = bar.add_task("reconstruct", total=steps, state=""), [""]
 
@@ -88,11 +87,9 @@ def reconstruct(
                                         "history": [step._asdict() for step in result.history]})  # fmt: skip
     table = Table("held-out view", "PSNR dB", "SSIM")
     for name in result.psnr:
-        table.add_row(name, f"{result.psnr[name]:.2f}", f"{result.ssim[name]:.4f}")
+        table.add_row(*row(name, f"{result.psnr[name]:.2f}", f"{result.ssim[name]:.4f}"))
     console.print(table)
-    console.print(
-        f"mean PSNR {result.mean_psnr:.2f} dB, SSIM {result.mean_ssim:.4f}; {out / 'gaussians.ply'}", highlight=False
-    )
+    console.print(said(f"mean PSNR {result.mean_psnr:.2f} dB, SSIM {result.mean_ssim:.4f}; {out / 'gaussians.ply'}"))
 
 
 def _settings(tau_t: float, tau_d: float, weighting: str, purity: float, min_seen: float | None) -> dict[str, Any]:
@@ -131,9 +128,9 @@ def segment(
     counts = segment_files(cloud, loaded, known, out, fill=fill, remove=remove or (), **settings)
     table = Table("id", "object", "Gaussians")
     for number, count in counts.items():
-        table.add_row(str(number), known.get(number, "never seen" if number < 0 else ""), str(count))
+        table.add_row(*row(number, known.get(number, "never seen" if number < 0 else ""), count))
     console.print(table)
-    console.print(f"written to {out}", highlight=False, markup=False)
+    console.print(said(f"written to {out}"))
 
 
 @app.command()
@@ -177,16 +174,13 @@ def evaluate(
     table = Table("prompt", "object", "views", *(f"{level} mIoU / mBIoU %" for level in scores))
     for prompt, number in report.evaluation.objects.items():
         cells = [_percent(*score.per_prompt[prompt]) for score in scores.values()]
-        table.add_row(escape(prompt), "missing" if number is None else str(number), str(report.views[prompt]), *cells)
+        table.add_row(*row(prompt, "missing" if number is None else number, report.views[prompt], *cells))
     table.add_section()
     table.add_row("mean", "", "", *(_percent(score.mean_iou, score.mean_boundary_iou) for score in scores.values()))
     console.print(table)
     missing = next(iter(scores.values())).missing
-    console.print(
-        f"prompts by {report.grounding}; {missing} masks missing, scored 0; {len(report.black)} black ones left out;"
-        f" written to {out}",
-        highlight=False, markup=False,
-    )  # fmt: skip
+    grounding = f"prompts by {report.grounding}; {missing} masks missing, scored 0"
+    console.print(said(f"{grounding}; {len(report.black)} black ones left out; written to {out}"))
 
 
 def _percent(iou: float, boundary_iou: float) -> str:

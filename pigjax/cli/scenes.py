@@ -7,16 +7,22 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 from rich.progress import TaskID
 from rich.table import Table
 
-from pigjax.cli.base import Out, app, console, one_device_per_core, progress
+from pigjax.cli.base import Out, app, console, one_device_per_core, output_path, progress, row, said
 from pigjax.errors import InputError
 
 AccuracyOption = Annotated[
     str | None, typer.Option("--accuracy", help="draft, standard or reference, instead of the scene file's.")
 ]
+File = Annotated[
+    Path,
+    typer.Option(
+        "--out", "-o", help="Video (.mp4, .gif), or one picture (.png).", parser=str,
+        callback=output_path, metavar="PATH",
+    ),
+]  # fmt: skip
 
 
 def example_folder() -> Path:
@@ -63,7 +69,7 @@ def _run(path: Path, out: Path, accuracy: str | None) -> None:
         report = run_scene(scene, out, progress=tell)
     table = Table("stage", "run s", "compile s")
     for name, spent in report.times.items():
-        table.add_row(name, f"{spent.run:.1f}", f"{spent.compile:.1f}")
+        table.add_row(*row(name, f"{spent.run:.1f}", f"{spent.compile:.1f}"))
     console.print(table)
     sizes = report.sizes
     console.print(
@@ -71,16 +77,14 @@ def _run(path: Path, out: Path, accuracy: str | None) -> None:
         f" {sizes['frames']} frames of {sizes['substeps_per_frame']} substeps"
     )
     for warning in report.warnings:
-        console.print(f"[yellow]note:[/] {escape(str(warning))}", highlight=False)
-    console.print(f"video: {report.files['video']}", highlight=False, markup=False)
+        console.print(said(warning, label="note: ", style="yellow"))
+    console.print(said(f"video: {report.files['video']}"))
 
 
 @app.command()
 def view(
     path: Annotated[Path, typer.Argument(help="A .ply, .splat or .spz.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Video (.mp4, .gif), or one picture (.png).")] = Path(
-        "view.mp4"
-    ),
+    out: File = Path("view.mp4"),
     frames: Annotated[int, typer.Option(help="Frames of one round.", min=1)] = 48,
     size: Annotated[int, typer.Option(help="Edge of the pictures in pixels.", min=16)] = 480,
     elevation: Annotated[float, typer.Option(help="Of the camera, in degrees.", min=-89, max=89)] = 25.0,
@@ -93,13 +97,14 @@ def view(
     from pigjax.scene.turntable import turntable
 
     cloud = io.load_gaussians(path)
+    io.output_folder(out.parent, files=(out.name,))
     with progress() as bar:
         task = bar.add_task("view", total=frames)
         turntable(
             cloud, out, frames=frames, size=size, elevation=elevation, up=up, background=background,
             progress=lambda done, of: bar.update(task, completed=done, total=of),
         )  # fmt: skip
-    console.print(f"written to {out}", highlight=False, markup=False)
+    console.print(said(f"written to {out}"))
 
 
 @app.command()
@@ -109,5 +114,5 @@ def info(path: Annotated[Path, typer.Argument(help="A .ply, .splat or .spz, a sc
 
     table = Table(show_header=False)
     for name, value in describe_file(path).items():
-        table.add_row(name, value)
+        table.add_row(*row(name, value))
     console.print(table)

@@ -8,10 +8,9 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.markup import escape
 from rich.table import Table
 
-from pigjax.cli.base import Out, app, console, one_device_per_core, progress
+from pigjax.cli.base import Out, app, console, one_device_per_core, progress, row, said
 
 
 @app.command()
@@ -33,14 +32,16 @@ def sweep(
         task = bar.add_task("sweep", total=None)
         table = sweep_study(loaded, out, progress=lambda done, of: bar.update(task, completed=done, total=of))
     name, mode = loaded.sweep.of, loaded.sweep.best
-    row = table.best_row(name, mode=mode)
+    best = table.best_row(name, mode=mode)
     columns = (*loaded.parameters, name)
-    shown = Table(*columns)
-    shown.add_row(*(_short(table[column][row]) for column in columns))
+    shown = Table()
+    for column in columns:
+        shown.add_column(said(column))
+    shown.add_row(*row(*(_short(table[column][best]) for column in columns)))
     console.print(shown)
     for error, count in Counter(error for error in table.errors if error).items():
-        console.print(f"[yellow]{count} rows marked:[/] {escape(error)}", highlight=False)
-    console.print(f"{len(table)} rows; the best above; written to {out}", highlight=False, markup=False)
+        console.print(said(error, label=f"{count} rows marked: ", style="yellow"))
+    console.print(said(f"{len(table)} rows; the best above; written to {out}"))
 
 
 def _join(coordinator: str, processes: int, process: int) -> None:
@@ -69,13 +70,10 @@ def tune(
         )
     table = Table("parameter", "value")
     for name, value in best.items():
-        table.add_row(name, _short(value))
+        table.add_row(*row(name, _short(value)))
     console.print(table)
-    console.print(
-        f"loss {history.least:.4g} from {history.loss[0]:.4g} after {len(history)} steps ({history.stop},"
-        f" {history.rejected} rejected); written to {out}",
-        highlight=False, markup=False,
-    )  # fmt: skip
+    course = f"loss {history.least:.4g} from {history.loss[0]:.4g} after {len(history)} steps"
+    console.print(said(f"{course} ({history.stop}, {history.rejected} rejected); written to {out}"))
 
 
 def _short(value: Any) -> str:

@@ -1,5 +1,14 @@
 """Files: the only package that touches them. Everything here runs on the host."""
 
+from pigjax.io.archives import (
+    load_array,
+    load_arrays,
+    plain_label,
+    save_arrays,
+    save_figure,
+    write_csv,
+    write_parquet,
+)
 from pigjax.io.cameras import Views, load_cameras, load_views
 from pigjax.io.datasets import LAYOUTS, Dataset, load_dataset
 from pigjax.io.files import (
@@ -9,12 +18,15 @@ from pigjax.io.files import (
     read_toml,
     remove,
     safe_name,
+    safe_names,
     write_json,
     write_text,
+    write_toml,
     writing,
 )
 from pigjax.io.formats import load_gaussians
 from pigjax.io.images import contact_sheet, read_image, write_image
+from pigjax.io.labels import StoredLabels, load_labels, save_labels
 from pigjax.io.masks import load_masks, save_masks
 from pigjax.io.ply import load_ply, load_points, read_ply, save_ply
 from pigjax.io.state import last_state, load_pytree, load_state, save_pytree, save_state
@@ -23,13 +35,17 @@ from pigjax.io.video import read_video, write_video
 __all__ = [
     "LAYOUTS",
     "Dataset",
+    "StoredLabels",
     "Views",
     "contact_sheet",
     "decoding",
     "last_state",
+    "load_array",
+    "load_arrays",
     "load_cameras",
     "load_dataset",
     "load_gaussians",
+    "load_labels",
     "load_masks",
     "load_ply",
     "load_points",
@@ -37,6 +53,7 @@ __all__ = [
     "load_state",
     "load_views",
     "output_folder",
+    "plain_label",
     "read_image",
     "read_json",
     "read_ply",
@@ -44,13 +61,20 @@ __all__ = [
     "read_video",
     "remove",
     "safe_name",
+    "safe_names",
+    "save_arrays",
+    "save_figure",
+    "save_labels",
     "save_masks",
     "save_ply",
     "save_pytree",
     "save_state",
+    "write_csv",
     "write_image",
     "write_json",
+    "write_parquet",
     "write_text",
+    "write_toml",
     "write_video",
     "writing",
 ]

@@ -7,13 +7,15 @@ import os
 import re
 import shutil
 import tomllib
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+import tomli_w
 
 from pigjax.errors import InputError, MissingFileError
 
@@ -25,9 +27,14 @@ def existing(path: PathLike, what: str) -> Path:
 
     Raises:
         MissingFileError: there is nothing at `path`.
+        InputError: no file can have such a path.
     """
     path = Path(path)
-    if not path.exists():
+    try:
+        found = path.exists()
+    except (OSError, ValueError) as error:  # too long, or in a folder that may not be entered
+        raise InputError(f"{path}: cannot be read ({_said(error)}); check the path.") from error
+    if not found:
         raise MissingFileError(f"{path}: no such {what}; check the path (working folder {Path.cwd()}).")
     return path
 
@@ -64,7 +71,7 @@ def decoding(path: PathLike, what: str, *, remedy: str = "copy or export it agai
     except InputError:
         raise
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or _reason(error)}); {remedy}.") from error
+        raise InputError(f"{path}: cannot be read ({_said(error)}); {remedy}.") from error
     except Exception as error:
         raise InputError(f"{path}: not a readable {what} ({_reason(error)}); {remedy}.") from error
 
@@ -96,11 +103,16 @@ def read_toml(path: PathLike) -> dict[str, Any]:
 def write_json(path: PathLike, content: Any) -> None:
     """Write any mix of dicts, lists, numbers, arrays, paths, dataclasses and structs; NaN and inf become null.
 
+    Bytes of a path that are not UTF-8 become U+FFFD, since JSON has no other form for them.
+
     Raises:
         InputError: the file cannot be written, or something in it has no JSON form.
     """
     try:
-        encoded = msgspec.json.encode(content, enc_hook=_plain)
+        try:
+            encoded = msgspec.json.encode(content, enc_hook=_plain)
+        except UnicodeEncodeError:
+            encoded = msgspec.json.encode(_whole_text(msgspec.to_builtins(content, enc_hook=_plain, str_keys=True)))
     except TypeError as error:
         raise InputError(
             f"{path}: content has no JSON form ({error}); give plain numbers, strings or arrays."
@@ -120,19 +132,22 @@ def writing(path: PathLike) -> Iterator[Path]:
         InputError: the folder or file cannot be written.
     """
     path = Path(path)
-    partial = path.with_name(f".{path.stem[:60]}.{os.getpid()}{path.suffix}")
+    if not path.name or "\0" in str(path) or not _is_encodable(str(path)):
+        raise InputError(f"{str(path)!r}: is not the name of a file; give one.")
+    mark = _utf8_prefix(path.stem, _LONGEST_MARK)
+    partial = path.with_name(f".pigjax-{os.getpid()}-{mark}{path.suffix}")
     try:
         _make_folder(path.parent)
-        if path.is_dir() and not path.is_symlink():
-            raise InputError(f"{path}: a folder lies where the file is to be written; move it, or choose another name.")
-        _remove_leftovers(path.parent, f".{path.stem[:60]}.", path.suffix)
+        _check_no_folder(path)
+        _remove_leftovers(path.parent, mark, path.suffix)
+        partial.unlink(missing_ok=True)  # a link of this name would be followed
         yield partial
         os.replace(partial, path)
     except InputError:
         raise
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be written ({error.strerror or error}); make room, or choose a folder you may write to."
+            f"{path}: cannot be written ({_said(error)}); make room, or choose a folder you may write to."
         ) from error
     finally:
         with suppress(OSError):
@@ -140,25 +155,53 @@ def writing(path: PathLike) -> Iterator[Path]:
 
 
 def write_text(path: PathLike, text: str) -> None:
-    """Write a text file in UTF-8, whole or not at all.
+    """Write a text file in UTF-8, whole or not at all; what UTF-8 cannot hold becomes U+FFFD.
 
     Raises:
         InputError: the file cannot be written.
     """
     with writing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_bytes(_whole_text(text).encode())
 
 
-def output_folder(path: PathLike) -> Path:
-    """The folder for results, made where it is missing and freed of the temporary files of killed processes.
+def write_toml(path: PathLike, content: Any) -> None:
+    """Write nested dicts of strings, numbers and lists as TOML; what UTF-8 cannot hold becomes U+FFFD, with a warning.
 
     Raises:
-        InputError: a file is in its place, or it cannot be made or written.
+        InputError: the file cannot be written, or something in it has no TOML form.
+    """
+    try:
+        text = tomli_w.dumps(content)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: content has no TOML form ({_reason(error)}); give plain numbers or text.") from error
+    if _whole_text(text) != text:
+        warnings.warn(f"{path}: a path in it is not UTF-8, as TOML asks; rename that folder.", stacklevel=2)
+    write_text(path, text)
+
+
+def output_folder(path: PathLike, *, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Path:
+    """The folder for results, made where it is missing and freed of the temporary files of killed processes.
+
+    Called before the work begins, it tells of a place that cannot be written before hours are spent.
+
+    Args:
+        path: the folder.
+        files: names of files that will be written into it.
+        folders: names of folders that will be made in it.
+
+    Raises:
+        InputError: a file is in its place, a folder is in the place of one of its files or the other way round, or it
+            cannot be made or written.
     """
     path = Path(path)
     _make_folder(path)
-    if not os.access(path, os.W_OK):
+    if not os.access(path, os.W_OK | os.X_OK):
         raise InputError(f"{path}: is read-only; choose a folder you may write to.")
+    for name in files:
+        _check_no_folder(path / name)
+    for name in folders:
+        if (path / name).exists() and not (path / name).is_dir():
+            raise InputError(f"{path / name}: a file lies where a folder is to be made; move it, or choose another -o.")
     with suppress(OSError):
         for folder in (path, *(entry for entry in path.iterdir() if entry.is_dir() and not entry.is_symlink())):
             _remove_leftovers(folder)
@@ -183,36 +226,77 @@ def remove(path: PathLike) -> None:
 
 def safe_name(name: str) -> str:
     """A name from a file as part of a file name: letters, digits and - _ . alone, so that it leads nowhere else."""
-    return re.sub(r"[^\w.-]+", "_", name).strip("._-")[:60] or "unnamed"
+    return _utf8_prefix(re.sub(r"[^\w.-]+", "_", name).strip("._-"), _LONGEST_NAME).strip("._-") or "unnamed"
+
+
+def safe_names(names: Sequence[str]) -> list[str]:
+    """`safe_name` of each name, told apart by a number where two would become the same file.
+
+    Names that differ only in case count as the same, as on many file systems. A name that needs no change keeps its
+    form, whatever others become.
+    """
+    safe = [safe_name(name) for name in names]
+    taken = {new.casefold() for new, name in zip(safe, names) if new == name}
+    given: set[str] = set()
+    for at, (new, name) in enumerate(zip(safe, names)):
+        number = 1
+        while safe[at].casefold() in given or (safe[at] != name and safe[at].casefold() in taken):
+            number += 1
+            safe[at] = f"{new}_{number}"
+        given.add(safe[at].casefold())
+    return safe
+
+
+def _utf8_prefix(text: str, most: int) -> str:
+    """The beginning of a text that takes at most so many bytes; file systems limit names by bytes."""
+    encoded = text.encode("utf-8", "surrogateescape")
+    return encoded[:most].decode(errors="ignore") if len(encoded) > most else text
+
+
+def _is_encodable(text: str) -> bool:
+    try:
+        os.fsencode(text)
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
-        file = next((p for p in (path, *path.parents) if p.exists() and not p.is_dir()), path)
+        file = next((p for p in (path, *path.parents) if (p.is_symlink() or p.exists()) and not p.is_dir()), path)
         raise InputError(f"{path}: {file} is a file, where a folder is needed; choose another folder.") from error
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be made ({error.strerror or error}); choose a folder you may write to."
-        ) from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be made ({_said(error)}); choose a folder you may write to.") from error
 
 
-def _remove_leftovers(folder: Path, start: str = ".", end: str = "") -> None:
-    """Remove temporary files of `writing` whose process has ended."""
+def _check_no_folder(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        raise InputError(f"{path}: a folder lies where the file is to be written; move it, or choose another name.")
+
+
+def _remove_leftovers(folder: Path, mark: str | None = None, suffix: str | None = None) -> None:
+    """Remove temporary files of `writing` whose process has ended, all or those of one file."""
     for entry in folder.glob(".*"):
-        if not (entry.name.startswith(start) and entry.name.endswith(end)) or entry.is_dir():
+        parts = _PARTIAL.fullmatch(entry.name) or _STATE_PARTIAL.fullmatch(entry.name)
+        if parts is None or entry.is_dir() or _runs(int(parts["process"])):
             continue
-        parts = _PARTIAL.fullmatch(entry.name)
-        if parts is not None and not _runs(int(parts["process"])):
+        if mark is None or (entry.suffix == suffix and parts["mark"] in (mark, f"{mark}{suffix}")):
             with suppress(OSError):
                 entry.unlink()
 
 
-_PARTIAL = re.compile(r"\..+\.(?P<process>[1-9]\d{0,9})(\.\w+)?")
+_LONGEST_NAME = 60  # bytes
+_LONGEST_MARK = 100  # bytes
+_PARTIAL = re.compile(r"\.pigjax-(?P<process>[1-9]\d{0,9})-(?P<mark>.*)", re.DOTALL)
+# how version 0.1 named them; only names that nobody else gives, since what matches is removed
+_STATE_PARTIAL = re.compile(r"\.(?P<mark>\d{6}|last|video|fit|search)\.(?P<process>[1-9]\d{0,9})\.(npz|ckpt|mp4)")
 
 
 def _runs(process: int) -> bool:
+    if os.name == "nt":  # there signal 0 is Ctrl-C
+        return True
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
@@ -225,6 +309,20 @@ def _runs(process: int) -> bool:
 def _reason(error: BaseException) -> str:
     said = str(error).strip().splitlines()
     return said[0][:200] if said else type(error).__name__
+
+
+def _said(error: BaseException) -> str:
+    """What the system says, without the path, which the message names."""
+    return (error.strerror if isinstance(error, OSError) else None) or _reason(error)
+
+
+def _whole_text(value: Any) -> Any:
+    """Lone surrogates, by which Python spells bytes of paths that are not UTF-8, replaced in any nest of texts."""
+    if isinstance(value, str):
+        return value.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
+    if isinstance(value, dict):
+        return {_whole_text(key): _whole_text(content) for key, content in value.items()}
+    return [_whole_text(content) for content in value] if isinstance(value, list | tuple) else value
 
 
 def _plain(value: Any) -> Any:

@@ -86,13 +86,18 @@ def load_masks(
 def save_masks(folder: PathLike, names: Sequence[str], masks: Integer[np.ndarray | Array, "t h w"]) -> None:
     """Write `<name>.png`, 8-bit where all ids fit, else 16-bit. Host.
 
+    A name with slashes, as views in sub-folders have, makes sub-folders; none may lead out of the folder.
+
     Raises:
-        InputError: an id is outside 0..65535, or the folder cannot be written.
+        InputError: an id is outside 0..65535, a name leads out of the folder, or the folder cannot be written.
     """
     masks = np.asarray(masks)
     low, high = int(masks.min(initial=0)), int(masks.max(initial=0))
     if low < 0 or high > 65535:
         raise InputError(f"{folder}: mask ids reach from {low} to {high}; keep them in 0..65535.")
+    for name in names:
+        if not name or Path(name).is_absolute() or ".." in Path(name).parts or "\\" in name:
+            raise InputError(f"{folder}: a view named {name!r} leads out of it; give names without '..'.")
     for name, mask in zip(names, masks, strict=True):
         with writing(Path(folder) / f"{name}.png") as partial:
             Image.fromarray(mask.astype(np.uint8 if high < 256 else np.uint16)).save(partial)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import BadZipFile
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +12,6 @@ import numpy as np
 from pigjax import io
 from pigjax.errors import InputError
 from pigjax.evaluation import Evaluation, evaluate_labels, ground_prompts, pixel_ids, reference_view
-from pigjax.io.files import existing
 from pigjax.metrics import mean_iou
 from pigjax.overlay import comparison_sheet
 from pigjax.scene.lifting import lift
@@ -62,11 +60,12 @@ def evaluate_files(
     Raises:
         InputError: files that do not fit each other, or cannot be written.
     """
+    out = io.output_folder(out, files=("scores.json", "sheet.png"))
     progress("lift", 0, 1)
     if labels is None:
         lifted = _lift(gaussians, dataset, fill=fill, **settings)
     else:
-        lifted = _read_labels(labels, len(gaussians))
+        lifted = Labels(*map(jnp.asarray, io.load_labels(labels, len(gaussians))))
         lifted = fill_unseen(gaussians, lifted) if fill else lifted
     progress("lift", 1, 1)
     cameras = {view: dataset.test.cameras[i] for i, view in enumerate(dataset.test.names)}
@@ -86,21 +85,6 @@ def _lift(gaussians: Gaussians, dataset: io.Dataset, **settings: Any) -> Labels:
     if dataset.masks is None or dataset.cameras is None:
         raise InputError("the data set was read without masks that vote; give labels.npz, or read it with vote=True.")
     return lift(gaussians, dataset.cameras, dataset.masks, **settings)
-
-
-def _read_labels(path: Path, count: int) -> Labels:
-    try:
-        with np.load(existing(path, "file of labels"), allow_pickle=False) as archive:
-            labels = Labels(*(jnp.asarray(archive[name]) for name in ("object_id", "votes", "confidence")))
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"{path}: not the labels.npz of 'pigjax segment' ({error}); segment the scene again."
-        ) from None
-    if labels.object_id.shape != (count,):
-        raise InputError(f"{path}: labels {len(labels.object_id)} Gaussians, the scene has {count}; segment it again.")
-    return labels
 
 
 def _grounding(

@@ -13,7 +13,8 @@ import numpy as np
 
 from pigjax import io
 from pigjax.editing import extract_object, hole_mask, remove_object
-from pigjax.errors import InputError, MissingFileError
+from pigjax.errors import InputError
+from pigjax.io.files import existing
 from pigjax.overlay import id_colours, id_image, legend_sheet, overlay
 from pigjax.pruning import contributions
 from pigjax.scene.lifting import lift
@@ -37,11 +38,12 @@ def segment_files(
     remove: Sequence[str] = (),
     **settings: Any,
 ) -> dict[int, int]:
-    """Lift masks and write `labels.npz`, `objects/<id>.ply`, `coloured.ply` and `objects.png`; Gaussians per id. Host.
+    """Lift masks and write `labels.npz`, `objects/<id>_<name>.ply`, `coloured.ply` and `objects.png`. Host.
 
-    For each object to remove also `removed/<id>.ply`, the scene without it, `removed/<id>/<view>.png`, its hole in
-    every view (white: what an inpainter must fill in), and `removed/<id>.png`, a few views before and after with the
-    hole in magenta.
+    For each object to remove also `removed/<id>_<name>.ply`, the scene without it, `removed/<id>_<name>/<view>.png`,
+    its hole in every view (white: what an inpainter must fill in), and `removed/<id>_<name>.png`, a few views before
+    and after with the hole in magenta. Names of objects and views enter names of files by `io.safe_name`, so nothing
+    is written outside of these folders.
 
     Args:
         gaussians: the scene.
@@ -52,17 +54,22 @@ def segment_files(
         remove: names or ids of objects.
         settings: of `lift_masks`.
 
+    Returns:
+        Gaussians of each id.
+
     Raises:
         InputError: masks that do not fit the views, files that cannot be written, or an unknown object.
     """
     doomed = [_id_of(name, names) for name in remove]
+    folders = ("objects", "removed") if doomed else ("objects",)
+    out = io.output_folder(out, files=("labels.npz", "coloured.ply", "objects.png"), folders=folders)
+    io.output_folder(out / "objects")
     train = views.subset("train") if "train" in views.splits else views
     assert train.masks is not None
     labels = lift(gaussians, train.cameras, train.masks, fill=fill, **settings)
     num_ids = labels.votes.shape[1]
     object_id = np.asarray(labels.object_id)
-    (out / "objects").mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(out / "labels.npz", object_id=object_id, votes=labels.votes, confidence=labels.confidence)
+    io.save_labels(out / "labels.npz", object_id, labels.votes, labels.confidence)
     counts = {int(number): int(np.sum(object_id == number)) for number in np.unique(object_id)}
     for number in counts:
         io.save_ply(out / "objects" / f"{_stem(number, names)}.ply", extract_object(gaussians, labels, number))
@@ -76,7 +83,7 @@ def segment_files(
 
 
 def _stem(number: int, names: dict[int, str]) -> str:
-    return "unseen" if number < 0 else f"{number:03d}" + (f"_{names[number]}" if number in names else "")
+    return "unseen" if number < 0 else f"{number:03d}" + (f"_{io.safe_name(names[number])}" if number in names else "")
 
 
 def _id_of(name: str, names: dict[int, str]) -> int:
@@ -89,11 +96,10 @@ def _id_of(name: str, names: dict[int, str]) -> int:
 def _remove(gaussians: Gaussians, labels: Labels, number: int, views: io.Views, folder: Path, stem: str) -> None:
     """The scene without one object, and the hole that it leaves in every view."""
     rest = remove_object(gaussians, labels, number)
-    folder.mkdir(parents=True, exist_ok=True)
     io.save_ply(folder / f"{stem}.ply", rest)
     seen = contributions(gaussians, views.cameras) > _LEAST_SEEN
     holes = [np.asarray(hole_mask(gaussians, labels, number, camera, seen=seen)) for camera in views.cameras]
-    io.save_masks(folder / stem, views.names, 255 * np.stack(holes).astype(np.int32))
+    io.save_masks(folder / stem, io.safe_names(views.names), 255 * np.stack(holes).astype(np.int32))
     pictures = []
     for view in np.argsort([-hole.sum() for hole in holes], kind="stable")[:_SHEET_VIEWS]:
         after = np.clip(np.asarray(render(rest, views.cameras[int(view)]).rgb), 0, 1)
@@ -128,8 +134,7 @@ def describe_file(path: Path) -> dict[str, str]:
         MissingFileError: there is no such file.
         InputError: it is damaged, or of no known kind.
     """
-    if not path.exists():
-        raise MissingFileError(f"{path}: does not exist; check the path.")
+    existing(path, "file or folder")
     if path.suffix.lower() == ".ply":
         return _describe_gaussians(io.read_ply(path, drop_invalid=True))
     if path.suffix.lower() in (".splat", ".spz"):

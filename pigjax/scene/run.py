@@ -29,6 +29,7 @@ from pigjax.sleep import Sleeper
 from pigjax.splat import Gaussians, render
 
 _SHEET_FRAMES = 12
+_FILES = ("video.mp4", "contact_sheet.png", "objects.png", "labels.npz", "report.json")
 Progress = Callable[[str, int, int], None]  # stage, done, of
 
 
@@ -49,8 +50,7 @@ def run_scene(scene: Scene, out_dir: str | os.PathLike[str], *, progress: Progre
             `out_dir` belong to another scene.
         SimulationError: the simulation broke down; states up to the last good frame are kept.
     """
-    out = Path(out_dir)
-    out.mkdir(parents=True, exist_ok=True)
+    out = io.output_folder(out_dir, files=_FILES, folders=("states",))
     report = RunReport()
     tell = progress or (lambda stage, done, of: None)
     with warnings.catch_warnings(record=True) as caught:
@@ -74,7 +74,7 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress) -> None:
         tell("seed", 0, 1)
         plan = make_plan(scene, inputs, labels)
         labels = plan.labels
-        np.savez_compressed(out / "labels.npz", object_id=labels.object_id, confidence=labels.confidence)
+        io.save_labels(out / "labels.npz", labels.object_id, labels.votes, labels.confidence)
     _describe(scene, inputs, plan, labels, report)
     with report.stage("simulate"):
         _simulate(scene, plan, out / "states", key, report, tell)
@@ -212,7 +212,7 @@ def _draw(
     tell("draw", frames + 1, frames + 1)
     io.write_image(out / "contact_sheet.png", io.contact_sheet(sheet))
     _draw_objects(inputs, labels, cameras[0], background, sheet[0], out / "objects.png")
-    for name in ("video.mp4", "contact_sheet.png", "objects.png", "labels.npz", "states", "report.json"):
+    for name in (*_FILES, "states"):
         report.files[name.split(".")[0]] = str(out / name)
 
 

@@ -173,4 +173,4 @@ def _read_target(folder: Path, target: Any) -> Float[Array, "t h w 3"]:
         return jnp.asarray(np.stack(pictures))
     if not path.is_file():
         raise MissingFileError(f"{path}: objective.options.target does not exist; check the path.")
-    return jnp.asarray(np.load(path) if path.suffix == ".npy" else io.read_video(path))
+    return jnp.asarray(io.load_array(path, "array of frames") if path.suffix == ".npy" else io.read_video(path))

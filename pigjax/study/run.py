@@ -11,10 +11,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tomli_w
 
 from pigjax import io
-from pigjax.errors import InputError, SceneError
+from pigjax.errors import SceneError
 from pigjax.study.experiment import Experiment, Outcome, experiment
 from pigjax.study.objectives import Objective, Scores, objective_of
 from pigjax.study.schema import Study, Value
@@ -35,7 +34,9 @@ def sweep_study(study: Study, out_dir: str | Path, *, progress: Callable[[int, i
     Raises:
         InputError: a file is missing, a parameter or an objective is unknown, or nothing could be scored.
     """
-    out = _made(out_dir)
+    out = io.output_folder(
+        out_dir, files=("table.csv", "table.npz", "sweep.png", "best.json", "best.toml"), folders=("rows",)
+    )
     rows = _rows(study)
     trial, shared = _trial(study, rows, soft=False)
     table = sweep(
@@ -67,7 +68,8 @@ def tune_study(
         InputError: a file is missing, a parameter or an objective is unknown, a start lies out of bounds.
         SimulationError: nothing that was tried could be simulated.
     """
-    out, spec = _made(out_dir), study.tune
+    files = ("history.npz", "history.png", "best.json", "best.toml")
+    out, spec = io.output_folder(out_dir, files=files), study.tune
     bounds = {name: _bounds(name, study) for name in study.parameters}
     ends = [{name: end} for name, own in study.parameters.items() for end in (own.low, own.high) if end is not None]
     trial, shared = _trial(study, ends, soft=spec.method == "adam")
@@ -176,7 +178,7 @@ def _leave_best(study: Study, best: Row, out: Path) -> None:
         name: jax.tree.map(lambda v: float(f"{v:.7g}"), np.asarray(value).tolist()) for name, value in best.items()
     }
     io.write_json(out / "best.json", plain)
-    (out / "best.toml").write_text(tomli_w.dumps(study.scene_values(plain, out)))
+    io.write_toml(out / "best.toml", study.scene_values(plain, out))
 
 
 def _draw(study: Study, table: Table, path: Path) -> None:
@@ -185,12 +187,3 @@ def _draw(study: Study, table: Table, path: Path) -> None:
         table.heat_map(path, scalars[0], scalars[1], study.sweep.of, mode=study.sweep.best)
     elif len(scalars) == 1:
         table.curve(path, scalars[0], study.sweep.of)
-
-
-def _made(out_dir: str | Path) -> Path:
-    out = Path(out_dir)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be made: {error.strerror}.") from None
-    return out

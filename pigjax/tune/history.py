@@ -5,13 +5,12 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from pigjax.io.files import writing
+from pigjax import io
 
 
 class Step(NamedTuple):
@@ -51,15 +50,22 @@ class History:
         return int((~self.good).sum())
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write all of it as `.npz`. Host."""
+        """Write all of it as `.npz`. Host.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
         named: dict[str, Any] = {f"parameters/{name}": values for name, values in self.parameters.items()}
         named |= {f"scores/{name}": values for name, values in self.scores.items()}
         own = {name: getattr(self, name) for name in ("loss", "gradient", "good", "seconds", "stop")}
-        with writing(Path(path)) as partial, partial.open("wb") as file:
-            np.savez_compressed(file, **own, **named)
+        io.save_arrays(path, own | named)
 
     def plot(self, path: str | os.PathLike[str]) -> None:
-        """Draw the loss and the single numbers among the parameters against the steps. Host."""
+        """Draw the loss and the single numbers among the parameters against the steps. Host.
+
+        Raises:
+            InputError: the suffix names no picture format, or the file cannot be written.
+        """
         from matplotlib.figure import Figure
 
         lines = [(name, values.reshape(len(self), -1)) for name, values in self.parameters.items()]
@@ -69,9 +75,9 @@ class History:
         first.set(ylabel="loss", yscale="log" if np.nanmin(self.loss, initial=np.inf) > 0 else "linear")
         for axes, (name, values) in zip(others, lines):
             axes.plot(np.arange(1, len(self) + 1), values)
-            axes.set_ylabel(name, fontsize=8)
+            axes.set_ylabel(io.plain_label(name), fontsize=8)
         figure.axes[-1].set_xlabel("step")
-        figure.savefig(path, dpi=110)
+        io.save_figure(path, figure, dpi=110)
 
 
 class Recorder:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,8 +12,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Shaped
 
-from pigjax.errors import InputError, MissingFileError
-from pigjax.io.files import writing
+from pigjax import io
+from pigjax.errors import InputError
 
 Columns = Mapping[str, Shaped[np.ndarray, "..."]]
 PathLike = str | os.PathLike[str]
@@ -104,14 +103,13 @@ class Table:
         suffix = Path(path).suffix.lower()
         if suffix not in write:
             raise InputError(f"{path}: unknown suffix {suffix!r}; use one of {', '.join(write)}.")
-        with writing(Path(path)) as partial:
-            write[suffix](partial)
+        write[suffix](path)
 
     def heat_map(self, path: PathLike, x: str, y: str, value: str, *, mode: Literal["min", "max"] = "min") -> None:
         """Draw a result over two parameters; bad rows are left white, the best is marked.
 
         Raises:
-            InputError: as `pivot`.
+            InputError: as `pivot`, the suffix names no picture format, or the file cannot be written.
         """
         from matplotlib.figure import Figure
 
@@ -119,21 +117,22 @@ class Table:
         figure = Figure(figsize=(5, 4), layout="constrained")
         axes = figure.subplots()
         image = axes.imshow(grid, origin="lower", aspect="auto", cmap="viridis")
-        axes.set(xlabel=x, ylabel=y, xticks=range(len(xs)), yticks=range(len(ys)))
+        axes.set(xlabel=io.plain_label(x), ylabel=io.plain_label(y), xticks=range(len(xs)), yticks=range(len(ys)))
         axes.set_xticklabels([f"{v:.3g}" for v in xs], rotation=45)
         axes.set_yticklabels([f"{v:.3g}" for v in ys])
         if np.isfinite(grid).any():
             best = np.nanargmin(grid) if mode == "min" else np.nanargmax(grid)
             row, column = np.unravel_index(best, grid.shape)
             axes.plot(column, row, "o", mfc="none", mec="red", ms=12)
-        figure.colorbar(image, label=value)
-        figure.savefig(path, dpi=120)
+        figure.colorbar(image, label=io.plain_label(value))
+        io.save_figure(path, figure)
 
     def curve(self, path: PathLike, x: str, value: str) -> None:
         """Draw a result over one parameter; bad rows are left out.
 
         Raises:
-            InputError: a column is unknown or no single number.
+            InputError: a column is unknown or no single number, the suffix names no picture format, or the file
+                cannot be written.
         """
         from matplotlib.figure import Figure
 
@@ -146,8 +145,8 @@ class Table:
         spread = at[order]
         if len(spread) > 2 and spread.min() > 0 and spread.max() / spread.min() > 30:
             axes.set_xscale("log")
-        axes.set(xlabel=x, ylabel=value)
-        figure.savefig(path, dpi=120)
+        axes.set(xlabel=io.plain_label(x), ylabel=io.plain_label(value))
+        io.save_figure(path, figure)
 
     def _scalars(self, name: str) -> np.ndarray:
         column = self[name]
@@ -164,26 +163,16 @@ class Table:
                 flat[name + (f"[{','.join(map(str, place))}]" if place else "")] = rows[(slice(None), *place)]
         return flat | {_OK: self.ok, _ERROR: np.array(self.errors, dtype=str)}
 
-    def _write_npz(self, path: Path) -> None:
+    def _write_npz(self, path: PathLike) -> None:
         named: dict[str, Any] = {f"parameters/{k}": v for k, v in self.parameters.items()}
         named |= {f"results/{k}": v for k, v in self.results.items()}
-        with path.open("wb") as file:
-            np.savez_compressed(file, **named, ok=self.ok, errors=np.array(self.errors, dtype=str))
+        io.save_arrays(path, named | {"ok": self.ok, "errors": np.array(self.errors, dtype=str)})
 
-    def _write_csv(self, path: Path) -> None:
-        flat = self._flat()
-        with path.open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(flat)
-            writer.writerows(zip(*(column.tolist() for column in flat.values())))
+    def _write_csv(self, path: PathLike) -> None:
+        io.write_csv(path, self._flat())
 
-    def _write_parquet(self, path: Path) -> None:
-        try:
-            import pyarrow
-            import pyarrow.parquet
-        except ImportError:
-            raise InputError("Parquet needs pyarrow: pip install 'pigjax[tables]', or save as .csv or .npz.") from None
-        pyarrow.parquet.write_table(pyarrow.table(self._flat()), path)
+    def _write_parquet(self, path: PathLike) -> None:
+        io.write_parquet(path, self._flat())
 
 
 def load_table(path: PathLike) -> Table:
@@ -191,17 +180,22 @@ def load_table(path: PathLike) -> Table:
 
     Raises:
         MissingFileError: there is no such file.
-        InputError: it is not such a file.
+        InputError: it is damaged, or not such a file.
     """
-    if not Path(path).is_file():
-        raise MissingFileError(f"{path}: no such table; check the path.")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            parts: dict[str, dict[str, np.ndarray]] = {"parameters": {}, "results": {}}
-            for key in file.files:
-                kind, _, name = key.partition("/")
-                if name:
-                    parts[kind][name] = file[key]
-            return Table(parts["parameters"], parts["results"], file["ok"], tuple(file["errors"].tolist()))
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise InputError(f"{path}: not a table that pigjax wrote ({error}).") from None
+    what, remedy = "table that pigjax wrote", "sweep again"
+    arrays = io.load_arrays(path, what, remedy=remedy)
+    with io.decoding(path, what, remedy=remedy):
+        ok, errors = arrays.pop("ok"), arrays.pop("errors")
+        if ok.dtype != bool or errors.dtype.kind != "U" or not ok.ndim == errors.ndim == 1:
+            raise ValueError(f"ok is {ok.dtype} {ok.shape}, errors {errors.dtype} {errors.shape}")
+        parts: dict[str, dict[str, np.ndarray]] = {"parameters": {}, "results": {}}
+        for key, column in arrays.items():
+            kind, _, name = key.partition("/")
+            if kind not in parts or not name:
+                raise ValueError(f"an array called {key}")
+            if column.dtype.kind not in "biufc" or column.shape[:1] != ok.shape:
+                raise ValueError(f"{key} is {column.dtype} {column.shape}, of {len(ok)} rows")
+            parts[kind][name] = column
+        if len(errors) != len(ok):
+            raise ValueError(f"{len(errors)} errors of {len(ok)} rows")
+    return Table(parts["parameters"], parts["results"], ok, tuple(errors.tolist()))

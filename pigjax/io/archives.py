@@ -1,0 +1,183 @@
+"""Arrays, tables and figures on disk: `.npy`, `.npz`, `.csv`, `.parquet`, and what matplotlib draws."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Shaped
+
+from pigjax.errors import InputError
+from pigjax.io.files import PathLike, decoding, existing, writing
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Columns = Mapping[str, Shaped[np.ndarray, "n"]]
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")  # how a text begins that a spreadsheet would compute
+
+
+class ArrayHeader(NamedTuple):
+    """What an archive says of an array before the array is read."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
+def save_arrays(path: PathLike, arrays: Mapping[str, Any]) -> None:
+    """Write named arrays as a compressed `.npz` that `numpy.load` reads, whole or not at all. Host.
+
+    Args:
+        path: of the file.
+        arrays: of numbers, truth values or texts, of any shape, by any names.
+
+    Raises:
+        InputError: an array holds Python objects, or the file cannot be written.
+    """
+    room = io.BytesIO()  # a disk that fills up meets one write of bytes
+    with zipfile.ZipFile(room, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, values in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                try:
+                    np.lib.format.write_array(file, np.asanyarray(values), allow_pickle=False)
+                except ValueError:
+                    raise InputError(
+                        f"{path}: array {name!r} holds Python objects; give numbers, truth values or texts."
+                    ) from None
+    with writing(path) as partial:
+        partial.write_bytes(room.getbuffer())
+
+
+def load_arrays(
+    path: PathLike, what: str, *, remedy: str, check: Callable[[Mapping[str, ArrayHeader]], None] | None = None
+) -> dict[str, np.ndarray]:
+    """Arrays of a `.npz` by name. Nothing in the file is run, and no memory is asked for that the file does not fill.
+
+    Args:
+        path: of the file.
+        what: the kind of file, for messages: "table".
+        remedy: what the reader of a message can do.
+        check: told {name: ArrayHeader} before any array is read; what it raises comes through.
+
+    Raises:
+        MissingFileError: there is no such file.
+        InputError: the file is damaged, holds Python objects, or `check` refuses it.
+    """
+    path = existing(path, what)
+    with decoding(path, what, remedy=remedy), zipfile.ZipFile(path) as archive:
+        headers = {info.filename.removesuffix(".npy"): _header(archive, info) for info in archive.infolist()}
+        if check is not None:
+            check(headers)
+        arrays = {}
+        for info in archive.infolist():
+            with archive.open(info) as file:
+                arrays[info.filename.removesuffix(".npy")] = np.lib.format.read_array(file, allow_pickle=False)
+                file.read()  # to the end, where the checksum is compared
+        return arrays
+
+
+def load_array(path: PathLike, what: str, *, remedy: str = "save it again") -> np.ndarray:
+    """The array of a `.npy`; no memory is asked for that the file does not fill.
+
+    Raises:
+        MissingFileError: there is no such file.
+        InputError: the file is damaged, or holds Python objects.
+    """
+    path = existing(path, what)
+    with decoding(path, what, remedy=remedy), path.open("rb") as file:
+        header = _read_header(file)
+        left = path.stat().st_size - file.tell()
+        if _bytes_of(header) > left:
+            raise ValueError(f"its header tells of {_bytes_of(header)} bytes, and {left} follow")
+        file.seek(0)
+        return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def write_csv(path: PathLike, columns: Columns) -> None:
+    """Write columns under their names as CSV in UTF-8. Host.
+
+    A text that a spreadsheet would take for a formula is led by an apostrophe.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow([_no_formula(name) for name in columns])
+    writer.writerows(zip(*([_no_formula(value) for value in column.tolist()] for column in columns.values())))
+    with writing(path) as partial:
+        partial.write_bytes(text.getvalue().encode(errors="replace"))
+
+
+def write_parquet(path: PathLike, columns: Columns) -> None:
+    """Write columns under their names as Parquet. Host.
+
+    Raises:
+        InputError: pyarrow is missing, or the file cannot be written.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise InputError("Parquet needs pyarrow: pip install 'pigjax[tables]', or save as .csv or .npz.") from None
+    with writing(path) as partial:
+        pyarrow.parquet.write_table(pyarrow.table(dict(columns)), partial)
+
+
+def save_figure(path: PathLike, figure: Figure, *, dpi: int = 120) -> None:
+    """Write a figure of matplotlib; the suffix picks the format.
+
+    Args:
+        path: of the picture.
+        figure: drawn already.
+        dpi: pixels per inch of the figure's size; 120 makes a plot of 5 inches 600 px wide.
+
+    Raises:
+        InputError: the suffix names no format, or the file cannot be written.
+    """
+    formats = figure.canvas.get_supported_filetypes()
+    suffix = Path(path).suffix.lower().removeprefix(".")
+    if suffix not in formats:
+        raise InputError(f"{path}: unknown suffix of a picture; use .png, .svg or .pdf.")
+    with writing(path) as partial:
+        figure.savefig(partial, dpi=dpi, format=suffix)
+
+
+def plain_label(text: str) -> str:
+    """A text as matplotlib draws it literally: dollar signs would begin mathematics."""
+    return "".join(letter if letter.isprintable() else " " for letter in text).replace("$", r"\$")
+
+
+def _header(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> ArrayHeader:
+    with archive.open(info) as file:
+        header = _read_header(file)
+        if _bytes_of(header) > info.file_size - file.tell():
+            raise ValueError(f"{info.filename} tells of {_bytes_of(header)} bytes and holds {info.file_size}")
+    return header
+
+
+def _read_header(file: Any) -> ArrayHeader:
+    version = np.lib.format.read_magic(file)
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    if read is None:
+        raise ValueError(f"version {version} of .npy")
+    shape, _, dtype = read(file)
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects")
+    if any(extent < 0 for extent in shape):
+        raise ValueError(f"shape {shape}")
+    return ArrayHeader(shape, dtype)
+
+
+def _bytes_of(header: ArrayHeader) -> int:
+    return math.prod(header.shape) * header.dtype.itemsize
+
+
+def _no_formula(value: Any) -> Any:
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value

@@ -1,0 +1,98 @@
+"""Labels on disk: `labels.npz`, the object of every Gaussian, which `run` and `segment` write and `evaluate` reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float, Integer, Num
+
+from pigjax.errors import InputError, MissingFileError
+from pigjax.io.archives import ArrayHeader, load_arrays, save_arrays
+from pigjax.io.files import PathLike
+
+_WHAT = "labels.npz of 'pigjax segment'"
+_REMEDY = "segment the scene again"
+
+
+class StoredLabels(NamedTuple):
+    """The arrays of `segmentation.Labels`, in the order of its fields."""
+
+    object_id: Integer[np.ndarray, "n"]  # 0 = background or contested, -1 = never seen
+    votes: Num[np.ndarray, "n m"]
+    confidence: Float[np.ndarray, "n"]
+
+
+def save_labels(
+    path: PathLike,
+    object_id: Integer[np.ndarray | Array, "n"],
+    votes: Num[np.ndarray | Array, "n m"],
+    confidence: Float[np.ndarray | Array, "n"],
+) -> None:
+    """Write labels as `.npz`, whole or not at all. Host.
+
+    Args:
+        path: of the file.
+        object_id: object of each Gaussian; 0 is background or contested, -1 never seen.
+        votes: views, or sums of alpha·T, for each id.
+        confidence: share of the votes that the winner took, 0 to 1.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    save_arrays(path, {"object_id": object_id, "votes": votes, "confidence": confidence})
+
+
+def load_labels(path: PathLike, count: int | None = None) -> StoredLabels:
+    """Labels of a file of `save_labels`. Host.
+
+    Args:
+        path: of the file.
+        count: Gaussians that it must label; None takes any number.
+
+    Raises:
+        MissingFileError: there is no such file.
+        InputError: the file is damaged, labels another number of Gaussians, or holds values that labels cannot have.
+    """
+
+    def check(headers: Mapping[str, ArrayHeader]) -> None:
+        _check_headers(path, headers, count)
+
+    try:
+        arrays = load_arrays(path, _WHAT, remedy=_REMEDY, check=check)
+    except MissingFileError:
+        raise
+    except InputError as error:
+        if error.__cause__ is None:
+            raise
+        raise InputError(f"{path}: not the {_WHAT} ({error.__cause__}); {_REMEDY}.") from error
+    labels = StoredLabels(*(arrays[name] for name in StoredLabels._fields))
+    lowest, highest = int(labels.object_id.min(initial=0)), int(labels.object_id.max(initial=0))
+    if not -1 <= lowest <= highest < 2**31:
+        raise InputError(f"{path}: object_id reaches from {lowest} to {highest}, not from -1 to 2³¹ - 1; {_REMEDY}.")
+    if not (np.isfinite(labels.votes).all() and (labels.votes >= 0).all()):
+        raise InputError(f"{path}: votes are negative or not finite; {_REMEDY}.")
+    if not ((labels.confidence >= 0) & (labels.confidence <= 1 + 1e-3)).all():  # sums of shares are rounded
+        raise InputError(f"{path}: confidence is not a share from 0 to 1; {_REMEDY}.")
+    return StoredLabels(labels.object_id.astype(np.int32), labels.votes, labels.confidence)
+
+
+def _check_headers(path: PathLike, headers: Mapping[str, ArrayHeader], count: int | None) -> None:
+    """Refuse arrays of another type or size before they are read."""
+    kinds = {"object_id": ("iu", 1, "whole numbers [n]"), "votes": ("iuf", 2, "numbers [n m]")}
+    kinds["confidence"] = ("f", 1, "real numbers [n]")
+    missing = [name for name in kinds if name not in headers]
+    if missing:
+        raise InputError(f"{path}: not the {_WHAT} (it has no {missing[0]}); {_REMEDY}.")
+    for name, (kind, axes, wanted) in kinds.items():
+        found = headers[name]
+        if found.dtype.kind not in kind or len(found.shape) != axes:
+            raise InputError(
+                f"{path}: not the {_WHAT} ({name} is {found.dtype} {list(found.shape)}, not {wanted}); {_REMEDY}."
+            )
+    rows = {name: headers[name].shape[0] for name in kinds}
+    if count is not None and rows["object_id"] != count:
+        raise InputError(f"{path}: labels {rows['object_id']} Gaussians, the scene has {count}; segment it again.")
+    if len(set(rows.values())) > 1:
+        raise InputError(f"{path}: its arrays differ in length ({rows}); {_REMEDY}.")
