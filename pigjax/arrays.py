@@ -26,14 +26,17 @@ def as_array(value: Any) -> Any:
     return value
 
 
-def array_field(**kwargs: Any) -> Any:
-    """Dynamic field that a user may sweep; a float given here never recompiles."""
-    return eqx.field(converter=as_array, **kwargs)
+def array_field(*, limits: Any = None, **kwargs: Any) -> Any:
+    """Dynamic field that a user may sweep; a float given here never recompiles. `checks.check_fields` reads `limits`."""
+    return eqx.field(converter=as_array, metadata={"limits": limits}, **kwargs)
 
 
-def static_field(**kwargs: Any) -> Any:
-    """Field that sizes a shape or picks a branch; a new value compiles anew."""
-    return eqx.field(static=True, **kwargs)
+def static_field(*, limits: Any = None, choices: Any = None, **kwargs: Any) -> Any:
+    """Field that sizes a shape or picks a branch; a new value compiles anew.
+
+    `checks.check_fields` reads the `limits` of its number, or the `choices` that it has.
+    """
+    return eqx.field(static=True, metadata={"limits": limits, "choices": choices}, **kwargs)
 
 
 @jax.custom_batching.custom_vmap

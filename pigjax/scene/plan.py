@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from pigjax import io
 from pigjax.camera import Camera, orbit, stack_cameras
+from pigjax.checks import suggest
 from pigjax.clamp import ClampParams
 from pigjax.colliders import Collider
 from pigjax.contact import BodyContact
@@ -24,7 +25,7 @@ from pigjax.matter import Particles
 from pigjax.mls_mpm import SimConfig
 from pigjax.particles import Binding, bind, seed_particles
 from pigjax.scene.lifting import lift
-from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec, suggest
+from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec
 from pigjax.segmentation import Labels
 from pigjax.sleep import Sleep
 from pigjax.solids import collider_from_gaussians

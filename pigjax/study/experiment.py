@@ -23,6 +23,7 @@ from scipy.cluster.vq import kmeans2
 
 from pigjax.boxes import box_for
 from pigjax.camera import Camera
+from pigjax.checks import suggest
 from pigjax.clamp import ClampParams
 from pigjax.colliders import Collider
 from pigjax.contact import BodyContact
@@ -32,7 +33,7 @@ from pigjax.matter import Grid, Health, Particles, Trajectory, fit_grid, vast_gr
 from pigjax.mls_mpm import SimConfig, choose_integrator, choose_substeps, rollout, stable_dt
 from pigjax.particles import Binding, at_frame, deform
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, render_config, segment
-from pigjax.scene.schema import Scene, suggest
+from pigjax.scene.schema import Scene
 from pigjax.splat import Gaussians, RenderConfig, Splats, render
 
 _NUMBERS = tuple(field.name for field in fields(Parameters))

@@ -14,9 +14,10 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from pigjax.camera import Camera
+from pigjax.checks import suggest
 from pigjax.errors import SceneError
 from pigjax.scene.plan import read_inputs
-from pigjax.scene.schema import Scene, suggest
+from pigjax.scene.schema import Scene
 from pigjax.segmentation import enough_capacity, lift_masks
 from pigjax.splat import Gaussians, RenderConfig, render
 
