@@ -27,7 +27,7 @@ def as_array(value: Any) -> Any:
 
 
 def array_field(*, limits: Any = None, **kwargs: Any) -> Any:
-    """Dynamic field that a user may sweep; a float given here never recompiles. `checks.check_fields` reads `limits`."""
+    """Dynamic field that a user may sweep; a float given here never recompiles. `check_fields` reads `limits`."""
     return eqx.field(converter=as_array, metadata={"limits": limits}, **kwargs)
 
 

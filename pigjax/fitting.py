@@ -65,12 +65,11 @@ class FitConfig(eqx.Module):
 
     def __check_init__(self):
         check_fields(self)
-        if self.start_splats is not None:
-            if (reached := count_at(self.steps - 1, self)) < self.splats:
-                raise InputError(
-                    f"FitConfig.start_splats = {self.start_splats} doubles to {reached} of splats = {self.splats}"
-                    f" within {self.steps} steps: lower grow_every = {self.grow_every}, or start with more."
-                )
+        if self.start_splats is not None and (reached := count_at(self.steps - 1, self)) < self.splats:
+            raise InputError(
+                f"FitConfig.start_splats = {self.start_splats} doubles to {reached} of splats = {self.splats}"
+                f" within {self.steps} steps: lower grow_every = {self.grow_every}, or start with more."
+            )
 
 
 class Photos(NamedTuple):

@@ -83,7 +83,7 @@ class RenderConfig(eqx.Module):
     transmittance_min: float = static_field(default=1e-4, limits=Limits(0, 1, below=True))
     dilation: float = static_field(default=0.3, limits=Limits(0, 1e6, unit="px²"))  # added to the 2D covariance
     antialias: bool = static_field(default=False)  # lower the opacity by what the dilation added
-    near: float = static_field(default=0.01, limits=Limits(0, 1e9, above=True, unit="m"))
+    near: float = static_field(default=0.01, limits=Limits(0.0, 1e9, unit="m"))
     # splats blended between two looks at a tile; None: 64, or 16 if few
     chunk: int | None = static_field(default=None, limits=Limits(1, 1_000_000))
     # walked together; None: 1 on a CPU, 2048 elsewhere
@@ -98,7 +98,7 @@ class RenderConfig(eqx.Module):
         check_fields(self)
         if self.alpha_min >= self.alpha_max:
             raise InputError(
-                f"RenderConfig.alpha_min = {self.alpha_min}: must be < alpha_max = {self.alpha_max}, or nothing is drawn."
+                f"RenderConfig.alpha_min = {self.alpha_min}: must be < alpha_max = {self.alpha_max}, or none is drawn."
             )
 
 

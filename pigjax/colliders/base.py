@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from pigjax.arrays import as_array, static_field
+from pigjax.checks import ANY, shown
 from pigjax.errors import InputError
 from pigjax.linalg import quat_multiply, quat_to_matrix, safe_norm, safe_normalize
 
@@ -78,10 +79,16 @@ class Collider(eqx.Module):
         if self.mode not in MODES:
             raise InputError(f"mode = {self.mode!r}: choose one of {', '.join(MODES)}.")
         for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not field.metadata.get("static", False) and isinstance(value, bool | str | bytes | dict | set):
+                raise InputError(f"{field.name} = {shown(value)}: it must be a number or an array of numbers.")
+            if isinstance(value, Array) and not isinstance(value, jax.core.Tracer) and not _is_numeric(value):
+                raise InputError(f"{field.name} = {shown(value)}: it must be real numbers.")
             self.require(field.name, "its numbers must be finite", np.isfinite)
+            self.require(field.name, "its numbers must be at most 1e15", lambda v: np.abs(v) <= ANY.high)
         self.require("friction", "a collider's friction coefficient must be >= 0", lambda friction: friction >= 0)
         self.require("softness", "it must be > 0 m, or None for a hard contact", lambda width: width > 0)
-        self.require("rotation", "a quaternion must not be zero", lambda quat: (quat != 0).any(-1))
+        self.require("rotation", "a quaternion must not be zero", lambda quat: (quat * quat).sum(-1) > 0)
 
     def require(self, name: str, rule: str, holds: Callable[[Any], Any]) -> None:
         """Raise an InputError that names the field if its values are concrete and break the rule."""
@@ -195,6 +202,10 @@ class Collider(eqx.Module):
             return self.velocity
         spin = jnp.cross(self.angular_velocity, points - self._pivot_at(time))
         return spin if self.velocity is None else self.velocity + spin
+
+
+def _is_numeric(value: Array) -> bool:
+    return jnp.issubdtype(value.dtype, jnp.floating) or jnp.issubdtype(value.dtype, jnp.integer)
 
 
 def _quat_of_spin(vector):

@@ -16,7 +16,7 @@ class Plane(Collider):
     normal: Float[Array, "3"] = number()  # out of the solid side, any length
 
     def __check_init__(self):
-        self.require("normal", "it must not be zero", lambda normal: (normal != 0).any(-1))
+        self.require("normal", "it must not be zero", lambda normal: (normal * normal).sum(-1) > 0)
 
     def shape_distance(self, points: Points) -> Float[Array, "*n"]:
         """Along the normal."""

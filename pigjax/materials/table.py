@@ -93,7 +93,7 @@ class Material(Parameters):
 
 # What each number is called, and its range where a law needs it or it is given.
 LIMITS: dict[str, tuple[str, Limits]] = {
-    "density": ("the density", Limits(0, above=True, unit="kg/m³")),
+    "density": ("the density", Limits(0, 1e9, above=True, unit="kg/m³")),
     "young": ("Young's modulus", Limits(0, above=True, unit="Pa")),
     "poisson": ("Poisson's ratio", Limits(-1, 0.5, above=True, below=True)),
     "yield_stress": ("the yield stress", Limits(0, above=True, unit="Pa")),
@@ -107,10 +107,10 @@ LIMITS: dict[str, tuple[str, Limits]] = {
     "flow_exponent": ("the flow exponent", Limits(0.1, 10.0)),
     "hardening_coefficient": ("the hardening coefficient", Limits(0.0, 1e3)),
     "critical_compression": ("the critical compression", Limits(0, 1, above=True, below=True)),
-    "critical_stretch": ("the critical stretch", Limits(0, above=True)),
+    "critical_stretch": ("the critical stretch", Limits(0, 1e3, above=True)),
     "fibre_stiffness": ("the stiffness of fibres", Limits(0, above=True, unit="Pa")),
-    "fibre_azimuth": ("the azimuth of fibres", Limits(unit="rad")),
-    "fibre_elevation": ("the elevation of fibres", Limits(unit="rad")),
+    "fibre_azimuth": ("the azimuth of fibres", Limits(-1e6, 1e6, unit="rad")),
+    "fibre_elevation": ("the elevation of fibres", Limits(-1e6, 1e6, unit="rad")),
 }
 # Laws, and what must hold between the numbers of one material.
 _JOINT_LIMITS = (

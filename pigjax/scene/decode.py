@@ -1,4 +1,4 @@
-"""Structs from plain values, as TOML gives them: every fault is named by the field's full name, the value, the remedy."""
+"""Structs from plain values, as TOML gives them: every error tells the field's full name, its value and the remedy."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ def decode(values: Any, kind: type[S], name: str = "", **given: Any) -> S:
         if field.required and field.name not in values:
             raise SceneError(f"{joined(name, field.name)} is missing: give {wanted(field.type)}{_range(field.type)}.")
     made = kind(**{key: _value(value, known[key].type, joined(name, key)) for key, value in values.items()}, **given)
-    for field, holds, rule in made.rules():
+    for broken, holds, rule in made.rules():
         if not holds:
-            value = getattr(made, field, None)
+            value = getattr(made, broken, None)
             said = f" = {shown(value)}" if isinstance(value, int | float | str | tuple) else ""
-            raise SceneError(f"{joined(name, field)}{said}: {rule}.")
+            raise SceneError(f"{joined(name, broken)}{said}: {rule}.")
     return made
 
 

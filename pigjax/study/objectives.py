@@ -75,7 +75,7 @@ def check_aim(object: str, frame: int, objects: Iterable[str], frames: int) -> N
         raise SceneError(f"objective.options.object = {shown(object)}: {suggest(object, objects)}.")
     if not -frames <= frame < frames:
         raise SceneError(
-            f"objective.options.frame = {frame}: it must be in [0, {frames - 1}], or count from the end, -1 to -{frames}."
+            f"objective.options.frame = {frame}: it must be in [0, {frames - 1}], or -1 to -{frames} from the end."
         )
 
 

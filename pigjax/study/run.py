@@ -180,7 +180,9 @@ def _start(name: str, study: Study, made: Experiment | Voting) -> jax.Array:
     spec = study.parameters[name]
     for field, value in (("low", spec.low), ("high", spec.high), ("start", own)):
         if value is not None and np.ndim(value) and np.shape(value) != present.shape:
-            raise SceneError(f"parameters.{name}.{field} = {list(value)}: give one number, or {present.size} of them.")
+            raise SceneError(
+                f"parameters.{name}.{field} = {np.asarray(value).tolist()}: give one number, or {present.size} of them."
+            )
     return present if own is None else jnp.broadcast_to(jnp.asarray(own, present.dtype), present.shape)
 
 

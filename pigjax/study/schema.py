@@ -34,14 +34,15 @@ class ParameterSpec(Section, frozen=True):
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """Ends are in order, have logarithms where those are asked for, and a start lies between them."""
-        lengths = {len(value) for value in (*(self.values or ()), self.start, self.low, self.high) if _is_list(value)}
+        given = (*(self.values or ()), self.start, self.low, self.high)
+        lengths = {len(value) for value in given if isinstance(value, tuple)}
         if self.values is not None:
             yield "values", len(self.values) > 0, "give one value or more"
-            alike = {len(value) if _is_list(value) else None for value in self.values}
+            alike = {np.shape(value) for value in self.values}
             yield "values", len(alike) < 2, "all values must have as many numbers as the first"
         for name in ("low", "high", "start"):
             own = getattr(self, name)
-            fits = not _is_list(own) or (lengths == {len(own)} and len(own) > 0)
+            fits = not isinstance(own, tuple) or (lengths == {len(own)} and len(own) > 0)
             yield name, fits, "give one number, or as many as the other values of the parameter have"
             positive = own is None or bool(np.all(np.greater(own, 0)))
             yield name, self.scale == "linear" or positive, "must be > 0 on a logarithmic scale"
@@ -159,13 +160,11 @@ class Study(Section, frozen=True):
     scene: str  # scene file, relative to the study file
     objective: ObjectiveSpec
     parameters: dict[str, ParameterSpec]
-    overrides: dict[str, Any] = field(
-        default_factory=dict
-    )  # fields of the scene that differ here: "simulation.frames" = 8
+    # fields of the scene that differ here: "simulation.frames" = 8
+    overrides: dict[str, Any] = field(default_factory=dict)
     only: list[str] | None = None  # objects that are simulated and drawn; None: all of the scene
-    regions: dict[str, Annotated[int, Limits(1, 10_000)]] = field(
-        default_factory=dict
-    )  # parts of an object with numbers of their own
+    # parts of an object with numbers of their own
+    regions: dict[str, Annotated[int, Limits(1, 10_000)]] = field(default_factory=dict)
     sweep: SweepSpec = SweepSpec()
     tune: TuneSpec = TuneSpec()
     folder: str = "."  # set by `load_study`; what relative paths start from
@@ -255,7 +254,3 @@ def load_study(path: str | Path, *, method: str | None = None) -> Study:
                 stacklevel=2,
             )
     return study
-
-
-def _is_list(value: Value | None) -> bool:
-    return isinstance(value, tuple)
