@@ -26,6 +26,14 @@ def as_array(value: Any) -> Any:
     return value
 
 
+def as_float(value: int | float) -> float:
+    """A float from a number of Python; infinity where an integer has too many digits for one."""
+    try:
+        return float(value)
+    except OverflowError:
+        return float("inf") if value > 0 else float("-inf")
+
+
 def array_field(*, limits: Any = None, **kwargs: Any) -> Any:
     """Dynamic field that a user may sweep; a float given here never recompiles. `check_fields` reads `limits`."""
     return eqx.field(converter=as_array, metadata={"limits": limits}, **kwargs)

@@ -53,7 +53,12 @@ class Limits:
 
     def broken(self, value: Any) -> str | None:
         """What a concrete number, or array of numbers, breaks: "must be > 0 m"; None where all are in range."""
-        wide = np.asarray(value, float)
+        try:
+            wide = np.asarray(value, float)
+        except OverflowError:
+            return f"must be {self._most()}"
+        except (TypeError, ValueError):
+            return "must be a number"
         wide = wide[~np.isnan(wide)] if self.nan else wide
         if not np.isfinite(wide).all():
             return "must be finite" if str(self).startswith("a finite") else f"must be finite, and {self}"
@@ -107,8 +112,8 @@ def check_fields(thing: Any) -> None:
             continue
         kind = next((kind for kind in wanted if kind != "None"), "")
         if not _is(value, kind):
-            raise InputError(f"{name} = {shown(value)}: must be {_KINDS[kind]}.")
-        if kind in ("int", "float") or limits is not None:
+            raise InputError(f"{name} = {shown(value)}: must be {_wanted(kind)}.")
+        if kind in ("int", "float") or limits is not None or kind.startswith(("Float", "tuple")):
             rule = (limits or (_WHOLE if kind == "int" else ANY)).broken(value)
             if rule is not None:
                 raise InputError(f"{name} = {shown(value)}: {rule}.")
@@ -123,7 +128,23 @@ def _is(value: Any, kind: str) -> bool:
         return isinstance(value, bool | np.bool_)
     if kind in ("int", "float"):
         return isinstance(value, Integral if kind == "int" else Real) and not isinstance(value, bool)
+    if kind.startswith("tuple["):
+        inner = kind.removeprefix("tuple[").removesuffix("]").split(", ")
+        return isinstance(value, tuple) and len(value) == len(inner) and all(map(_is, value, inner))
+    if kind.startswith("Float["):
+        return is_numeric(value)
     return kind != "str" or isinstance(value, str)
+
+
+def is_numeric(value: Any) -> bool:
+    """Whether a value is a real number, or an array of them."""
+    return isinstance(value, Real | np.ndarray | jax.Array) and np.asarray(value).dtype.kind in "fiu"
+
+
+def _wanted(kind: str) -> str:
+    if kind.startswith("tuple["):
+        return f"{kind.count(',') + 1} numbers"
+    return _KINDS.get(kind, "a number, or an array of numbers")
 
 
 def shown(value: Any) -> str:

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pigjax.arrays import static_field
+from pigjax.arrays import as_array, static_field
 from pigjax.checks import Limits, check_fields
 from pigjax.errors import InputError
 from pigjax.linalg import safe_norm, safe_normalize
@@ -30,7 +30,7 @@ class BodyContact(eqx.Module):
 
     bodies: int = static_field()  # how many; particles have bodies 0 to this number - 1
     friction: Float[Array, ""] = eqx.field(
-        converter=jnp.asarray, default=0.0, metadata={"limits": Limits(0.0, 1e6)}
+        converter=as_array, default=0.0, metadata={"limits": Limits(0.0, 1e6)}
     )  # Coulomb's coefficient
 
     def __check_init__(self):

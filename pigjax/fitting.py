@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from pigjax.arrays import static_field
 from pigjax.camera import Camera
-from pigjax.checks import LARGEST_WHOLE, Limits, check_fields
+from pigjax.checks import LARGEST_WHOLE, Limits, check_fields, shown
 from pigjax.errors import InputError
 from pigjax.metrics import ssim
 from pigjax.relocation import relocate, shake
@@ -65,6 +65,8 @@ class FitConfig(eqx.Module):
 
     def __check_init__(self):
         check_fields(self)
+        if not isinstance(self.render, RenderConfig):
+            raise InputError(f"FitConfig.render = {shown(self.render)}: must be a RenderConfig.")
         if self.start_splats is not None and (reached := count_at(self.steps - 1, self)) < self.splats:
             raise InputError(
                 f"FitConfig.start_splats = {self.start_splats} doubles to {reached} of splats = {self.splats}"

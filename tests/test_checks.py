@@ -1,15 +1,11 @@
 """Values are checked where they are written: any field of any schema takes a legal value or tells its full name."""
 
-import dataclasses
-import itertools
 import math
-import types
-from functools import partial
-from inspect import signature
+import subprocess
+import sys
 from pathlib import Path
 from typing import get_args, get_origin
 
-import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
@@ -20,28 +16,24 @@ from hypothesis import strategies as st
 from test_scene import ball
 from typer.testing import CliRunner
 
-import pigjax as pj
 from pigjax import io
-from pigjax.camera import Camera, look_at, stack_cameras
-from pigjax.checks import Limits, shown
+from pigjax.camera import look_at, stack_cameras
 from pigjax.clamp import ClampParams
 from pigjax.cli import app
-from pigjax.colliders import Plane, Sphere
-from pigjax.contact import BodyContact
 from pigjax.errors import InputError, SceneError
-from pigjax.fitting import FitConfig
-from pigjax.materials import LIMITS, PRESETS, Material, Parameters
-from pigjax.matter import SimConfig
-from pigjax.scene import plan, scene_from
-from pigjax.scene.decode import Section, limits_of, numbers_of
-from pigjax.scene.schema import ObjectSpec, Scene
-from pigjax.sleep import Sleep
+from pigjax.materials import LIMITS, PRESETS, Parameters
+from pigjax.matter import Trajectory, make_particles
+from pigjax.materials import material_table, preset
+from pigjax.particles import at_frame
+from pigjax.scene import load_scene, plan, scene_from
+from pigjax.scene.decode import Section, numbers_of
+from pigjax.scene.schema import Scene, SimulationSpec
 from pigjax.splat import RenderConfig
-from pigjax.study import OBJECTIVES, load_study, sweep_study
-from pigjax.study.objectives import aim, objective_of
-from pigjax.study.schema import MOST_ROWS, OPTIONS, Study
+from pigjax.study import OBJECTIVES, load_study
+from pigjax.study.objectives import check_aim, objective_of
+from pigjax.study.run import _rows
+from pigjax.study.schema import OPTIONS, Study
 from pigjax.transfers import KERNELS
-from pigjax.tune import Bounds
 
 VALUES = (math.nan, math.inf, -math.inf, -1, 0, 1e30, 2**40, 10**400, 1e-45, "text", [], {}, None, True, [math.nan] * 3)
 ROUND = {"start": [0, 0, 0], "end": [0, 0, 1], "radius": 0.1}
@@ -127,5 +119,17 @@ def check_scene(path, value):
 @given(st.sampled_from(SCENE_FIELDS), st.sampled_from(VALUES))
 def test_any_value_of_any_scene_field_is_legal_or_one_line_that_names_it(path, value):
     check_scene(path, value)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from(STUDY_FIELDS), st.sampled_from(VALUES))
+def test_any_value_of_any_study_field_is_legal_or_one_line_that_names_it(path, value):
+    study_of(tmp := Path(STUDY_FOLDER.name), path, value)
+    assert tmp.is_dir()
+
+
+@pytest.fixture(scope="module")
+def study_folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("studies")
 
 

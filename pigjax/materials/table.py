@@ -11,17 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from pigjax.arrays import as_array, static_field
-from pigjax.checks import Limits, shown
+from pigjax.arrays import as_array, as_float, static_field
+from pigjax.checks import Limits, is_numeric, shown
 from pigjax.errors import InputError
 from pigjax.materials.laws import law_of
 
 
 def _number(**kwargs):
     """A number that a user may sweep: always an array, so that a new value never recompiles."""
-    return eqx.field(
-        converter=lambda v: jnp.asarray(v, float) if isinstance(v, int | float) else as_array(v), kw_only=True, **kwargs
-    )
+    return eqx.field(converter=_as_number, kw_only=True, **kwargs)
+
+
+def _as_number(value):
+    real = isinstance(value, int | float) and not isinstance(value, bool)
+    return jnp.asarray(as_float(value)) if real else as_array(value)
 
 
 class Parameters(eqx.Module):
@@ -71,14 +74,18 @@ class Material(Parameters):
     model: str = static_field()  # one of `materials.LAWS`
 
     def __check_init__(self):
+        if not isinstance(self.model, str):
+            raise InputError(f"model = {shown(self.model)}: it must be the name of a law.")
+        for number in fields(Parameters):
+            value = getattr(self, number.name)
+            if not isinstance(value, jax.core.Tracer) and not is_numeric(value):
+                raise InputError(f"{number.name} = {shown(value)}: {LIMITS[number.name][0]} must be a number.")
         needed = ("density", *law_of(self.model).needs)
         for name, (noun, limits) in LIMITS.items():
             value = getattr(self, name)
             if isinstance(value, jax.core.Tracer):
                 continue
             value = np.asarray(value)
-            if value.dtype == object or not np.issubdtype(value.dtype, np.number):
-                raise InputError(f"{name} = {shown(value)}: {noun} must be a number.")
             given = name in needed or np.any(value != 0)
             rule = limits.broken(value) if given else None
             if rule is not None:
@@ -101,8 +108,8 @@ LIMITS: dict[str, tuple[str, Limits]] = {
     "residual_stress": ("the residual yield stress", Limits(0.0, unit="Pa")),
     "friction_angle": ("the friction angle", Limits(0, np.pi / 2, above=True, below=True, unit="rad")),
     "cohesion": ("the cohesion", Limits(0.0, unit="Pa")),
-    "bulk": ("the bulk modulus, given or from young and poisson,", Limits(0, above=True, unit="Pa")),
     "bulk_modulus": ("the bulk modulus", Limits(0.0, unit="Pa")),
+    "bulk": ("the bulk modulus, given or from young and poisson,", Limits(0, above=True, unit="Pa")),
     "viscosity": ("the viscosity", Limits(0.0, unit="Pa s")),
     "flow_exponent": ("the flow exponent", Limits(0.1, 10.0)),
     "hardening_coefficient": ("the hardening coefficient", Limits(0.0, 1e3)),

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pigjax.checks import shown
+from pigjax.checks import ANY, shown
 from pigjax.errors import InputError
 
 End = float | tuple[float, ...] | None
@@ -46,6 +46,8 @@ class Bounds:
         for name, end in (("low", self.low), ("high", self.high)):
             if end is not None and not np.isfinite(end).all():
                 raise InputError(f"Bounds.{name} = {end}: must be finite, or None for no bound.")
+            if end is not None and ANY.broken(end) is not None:
+                raise InputError(f"Bounds.{name} = {shown(end)}: {ANY.broken(end)}.")
         if self.low is not None and self.high is not None and not np.all(np.less(self.low, self.high)):
             raise InputError(f"Bounds: low = {self.low} is not below high = {self.high}; exchange them.")
         for name, end in (("low", self.low), ("high", self.high)):
