@@ -46,8 +46,7 @@ class ClampParams(eqx.Module):
         known = not any(isinstance(bound, jax.core.Tracer) for bound in (self.tau_min, self.tau_max))
         if known and bool(jnp.any(self.tau_min > self.tau_max)):
             raise InputError(
-                f"ClampParams.tau_min = {shown(self.tau_min)}: must not be above tau_max = {shown(self.tau_max)};"
-                " exchange them."
+                f"ClampParams.tau_min = {shown(self.tau_min)} exceeds tau_max = {shown(self.tau_max)}; exchange them."
             )
 
 
