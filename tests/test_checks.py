@@ -184,7 +184,7 @@ def test_deep_and_long_toml_is_one_line(tmp_path, text):
 def test_indices_beyond_the_end_are_refused_never_clamped():
     with pytest.raises(SceneError, match=r"objective\.options\.frame = 99: it must be in \[0, 3\]"):
         check_aim("duck", 99, ("duck",), 4)
-    camera = look_at((0, -1.0, 0), target=(0, 0, 0), focal=10.0, width=4, height=4)
+    camera = look_at((0.0, -1.0, 0.0), target=(0.0, 0.0, 0.0), focal=10.0, width=4, height=4)
     with pytest.raises(IndexError, match="camera 5 of a batch of 1"):
         stack_cameras([camera])[5]
 
