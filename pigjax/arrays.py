@@ -26,14 +26,25 @@ def as_array(value: Any) -> Any:
     return value
 
 
-def array_field(**kwargs: Any) -> Any:
-    """Dynamic field that a user may sweep; a float given here never recompiles."""
-    return eqx.field(converter=as_array, **kwargs)
+def as_float(value: int | float) -> float:
+    """A float from a number of Python; infinity where an integer has too many digits for one."""
+    try:
+        return float(value)
+    except OverflowError:
+        return float("inf") if value > 0 else float("-inf")
 
 
-def static_field(**kwargs: Any) -> Any:
-    """Field that sizes a shape or picks a branch; a new value compiles anew."""
-    return eqx.field(static=True, **kwargs)
+def array_field(*, limits: Any = None, **kwargs: Any) -> Any:
+    """Dynamic field that a user may sweep; a float given here never recompiles. `check_fields` reads `limits`."""
+    return eqx.field(converter=as_array, metadata={"limits": limits}, **kwargs)
+
+
+def static_field(*, limits: Any = None, choices: Any = None, **kwargs: Any) -> Any:
+    """Field that sizes a shape or picks a branch; a new value compiles anew.
+
+    `checks.check_fields` reads the `limits` of its number, or the `choices` that it has.
+    """
+    return eqx.field(static=True, metadata={"limits": limits, "choices": choices}, **kwargs)
 
 
 @jax.custom_batching.custom_vmap

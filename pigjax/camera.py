@@ -35,7 +35,14 @@ class Camera(eqx.Module):
         return jnp.linalg.inv(self.world_to_cam)[..., :3, 3]
 
     def __getitem__(self, index) -> Camera:
-        """One camera, or a slice, of a batch."""
+        """One camera, or a slice, of a batch.
+
+        Raises:
+            IndexError: the batch has no such camera (where the index is known; JAX would take the last one).
+            TypeError: the camera is a single one.
+        """
+        if isinstance(index, int | np.integer) and not -len(self) <= index < len(self):
+            raise IndexError(f"camera {index} of a batch of {len(self)}: the last is {len(self) - 1}.")
         return Camera(self.world_to_cam[index], self.focal[index], self.centre[index], self.width, self.height)
 
     def __iter__(self) -> Iterator[Camera]:

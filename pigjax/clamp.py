@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from pigjax.arrays import array_field, static_field
+from pigjax.checks import Limits, check_fields, shown
 from pigjax.errors import InputError
 from pigjax.linalg import aligned_svd, matmul3, polar, quat_to_matrix, svd
 from pigjax.splat import Gaussians, Splats
@@ -29,20 +30,24 @@ class ClampParams(eqx.Module):
     lambda_R = 1.2 turns axes further than the matter does.
 
     Raises:
-        InputError: tau_min > tau_max, when both are known (not while tracing).
+        InputError: a number is not finite or out of range, or tau_min > tau_max; while tracing none is known.
     """
 
-    tau_min: Float[Array, "*batch"] = array_field(default=0.5)  # of the rest scale [-], or [m] if not relative
-    tau_max: Float[Array, "*batch"] = array_field(default=2.0)
-    lambda_R: Float[Array, "*batch"] = array_field(default=1.2)  # R^t = R + lambda_R (R' - R)
-    lambda_S: Float[Array, "*batch"] = array_field(default=0.8)  # S^t = S + lambda_S (S^tau - S)
+    # of the rest scale [-], or [m] if not relative
+    tau_min: Float[Array, "*batch"] = array_field(default=0.5, limits=Limits(0, 1e9))
+    tau_max: Float[Array, "*batch"] = array_field(default=2.0, limits=Limits(0, 1e9, above=True))
+    lambda_R: Float[Array, "*batch"] = array_field(default=1.2, limits=Limits(-1e3, 1e3))  # R^t = R + lambda_R (R' - R)
+    # S^t = S + lambda_S (S^tau - S)
+    lambda_S: Float[Array, "*batch"] = array_field(default=0.8, limits=Limits(-1e3, 1e3))
     relative: bool = static_field(default=True)  # tau in units of each rest scale, else in metres
 
     def __check_init__(self):
-        bounds = (self.tau_min, self.tau_max)
-        known = all(isinstance(b, jax.Array) and not isinstance(b, jax.core.Tracer) for b in bounds)
-        if known and bool((self.tau_min > self.tau_max).any()):
-            raise InputError(f"ClampParams: tau_min = {self.tau_min} exceeds tau_max = {self.tau_max}; exchange them.")
+        check_fields(self)
+        known = not any(isinstance(bound, jax.core.Tracer) for bound in (self.tau_min, self.tau_max))
+        if known and bool(jnp.any(self.tau_min > self.tau_max)):
+            raise InputError(
+                f"ClampParams.tau_min = {shown(self.tau_min)} exceeds tau_max = {shown(self.tau_max)}; exchange them."
+            )
 
 
 def eigen_clamp(

@@ -7,11 +7,11 @@ field of plain MPM they would take one velocity: no slip, and cohesion when they
 from __future__ import annotations
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pigjax.arrays import static_field
+from pigjax.arrays import as_array, static_field
+from pigjax.checks import Limits, check_fields
 from pigjax.errors import InputError
 from pigjax.linalg import safe_norm, safe_normalize
 
@@ -29,13 +29,14 @@ class BodyContact(eqx.Module):
     """
 
     bodies: int = static_field()  # how many; particles have bodies 0 to this number - 1
-    friction: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.0)  # Coulomb's coefficient
+    friction: Float[Array, ""] = eqx.field(
+        converter=as_array, default=0.0, metadata={"limits": Limits(0.0, 1e6)}
+    )  # Coulomb's coefficient
 
     def __check_init__(self):
-        if self.bodies < 2:
+        if not isinstance(self.bodies, int) or self.bodies < 2:
             raise InputError(f"BodyContact.bodies = {self.bodies}: contact needs two bodies or more.")
-        if not isinstance(self.friction, jax.core.Tracer) and not self.friction >= 0:
-            raise InputError(f"BodyContact.friction = {self.friction}: must be >= 0.")
+        check_fields(self)
 
     def part(
         self,

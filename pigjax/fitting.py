@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from pigjax.arrays import static_field
 from pigjax.camera import Camera
+from pigjax.checks import LARGEST_WHOLE, Limits, check_fields, shown
 from pigjax.errors import InputError
 from pigjax.metrics import ssim
 from pigjax.relocation import relocate, shake
@@ -22,46 +23,55 @@ from pigjax.splat import Gaussians, RenderConfig, render
 
 
 class FitConfig(eqx.Module):
-    """Settings of a reconstruction, all static. Learning rates are those of Adam, per step."""
+    """Settings of a reconstruction, all static.
 
-    steps: int = static_field(default=3000)
-    splats: int = static_field(default=15_000)
-    start_splats: int | None = static_field(default=None)  # doubled every `grow_every` steps up to `splats`; None: all
-    grow_every: int = static_field(default=500)
-    sh_degree: int = static_field(default=1)
-    ssim_weight: float = static_field(default=0.2)  # 0 traces no SSIM
-    background: float = static_field(default=0.0)  # grey level behind the splats, as in the photos
-    object_id: int | None = static_field(default=None)  # fit only what the masks give this id
+    Learning rates are those of Adam, per step.
+
+    Raises:
+        InputError: a number is not finite or out of range, or the splats do not grow to their number.
+    """
+
+    steps: int = static_field(default=3000, limits=Limits(1, 100_000_000))
+    splats: int = static_field(default=15_000, limits=Limits(4, LARGEST_WHOLE))
+    # doubled every `grow_every` steps up to `splats`; None: all
+    start_splats: int | None = static_field(default=None, limits=Limits(4, LARGEST_WHOLE))
+    grow_every: int = static_field(default=500, limits=Limits(1, LARGEST_WHOLE))
+    sh_degree: int = static_field(default=1, limits=Limits(0, 3))
+    ssim_weight: float = static_field(default=0.2, limits=Limits(0, 1))  # 0 traces no SSIM
+    background: float = static_field(default=0.0, limits=Limits(0, 1))  # grey level behind the splats, as in the photos
+    # fit only what the masks give this id
+    object_id: int | None = static_field(default=None, limits=Limits(0, LARGEST_WHOLE))
     random_background: bool = static_field(default=False)  # a new colour each step behind what the masks cover
-    pose_rate: float = static_field(default=0.0)  # of the training cameras [rad, extent]; 0 keeps their poses
-    means_rate: float = static_field(default=4e-4)  # times the extent of the points, falls to a hundredth
-    scales_rate: float = static_field(default=1e-2)
-    quats_rate: float = static_field(default=2e-3)
-    opacities_rate: float = static_field(default=5e-2)
-    sh_rate: float = static_field(default=5e-3)  # a twentieth of it for the bands above 0
-    band_every: int = static_field(default=500)  # steps between one SH band and the next
-    relocate_every: int = static_field(default=100)  # steps; 0 never moves a splat
-    relocate_until: float = static_field(default=0.8)  # share of the steps
-    noise: float = static_field(default=2e3)  # of the centres, times their rate; 0 traces none
-    opacity_regularizer: float = static_field(default=0.002)
-    scale_regularizer: float = static_field(default=0.002)  # per extent of the points
-    evaluate_every: int = static_field(default=500)
-    preview_every: int = static_field(default=0)  # steps between pictures of a view; 0 for none
-    seed: int = static_field(default=0)
+    # of the training cameras [rad, extent]; 0 keeps their poses
+    pose_rate: float = static_field(default=0.0, limits=Limits(0, 1e3))
+    # times the extent of the points, falls to a hundredth
+    means_rate: float = static_field(default=4e-4, limits=Limits(0, 1e3))
+    scales_rate: float = static_field(default=1e-2, limits=Limits(0, 1e3))
+    quats_rate: float = static_field(default=2e-3, limits=Limits(0, 1e3))
+    opacities_rate: float = static_field(default=5e-2, limits=Limits(0, 1e3))
+    sh_rate: float = static_field(default=5e-3, limits=Limits(0, 1e3))  # a twentieth of it for the bands above 0
+    # steps between one SH band and the next
+    band_every: int = static_field(default=500, limits=Limits(0, LARGEST_WHOLE))
+    relocate_every: int = static_field(default=100, limits=Limits(0, LARGEST_WHOLE))  # steps; 0 never moves a splat
+    relocate_until: float = static_field(default=0.8, limits=Limits(0, 1))  # share of the steps
+    noise: float = static_field(default=2e3, limits=Limits(0, 1e9))  # of the centres, times their rate; 0 traces none
+    opacity_regularizer: float = static_field(default=0.002, limits=Limits(0, 1e6))
+    scale_regularizer: float = static_field(default=0.002, limits=Limits(0, 1e6))  # per extent of the points
+    evaluate_every: int = static_field(default=500, limits=Limits(1, LARGEST_WHOLE))
+    # steps between pictures of a view; 0 for none
+    preview_every: int = static_field(default=0, limits=Limits(0, LARGEST_WHOLE))
+    seed: int = static_field(default=0, limits=Limits(0, LARGEST_WHOLE - 2))
     render: RenderConfig = static_field(default=RenderConfig())
 
     def __check_init__(self):
-        if self.start_splats is not None:
-            if self.start_splats < 4 or self.grow_every < 1:
-                raise InputError(
-                    f"FitConfig.start_splats = {self.start_splats}, grow_every = {self.grow_every}: start with 4 splats"
-                    " or more, and let a step or more pass between doublings."
-                )
-            if (reached := count_at(self.steps - 1, self)) < self.splats:
-                raise InputError(
-                    f"FitConfig.start_splats = {self.start_splats} doubles to {reached} of splats = {self.splats}"
-                    f" within {self.steps} steps: lower grow_every = {self.grow_every}, or start with more."
-                )
+        check_fields(self)
+        if not isinstance(self.render, RenderConfig):
+            raise InputError(f"FitConfig.render = {shown(self.render)}: must be a RenderConfig.")
+        if self.start_splats is not None and (reached := count_at(self.steps - 1, self)) < self.splats:
+            raise InputError(
+                f"FitConfig.start_splats = {self.start_splats} doubles to {reached} of splats = {self.splats}"
+                f" within {self.steps} steps: lower grow_every = {self.grow_every}, or start with more."
+            )
 
 
 class Photos(NamedTuple):

@@ -300,7 +300,14 @@ def deform(
 
 
 def at_frame(particles: Particles, trajectory: Trajectory, frame: int | Int[Array, ""]) -> Particles:
-    """Particles as they are drawn after a frame; the elastic F and C stay as in `particles`."""
+    """Particles as they are drawn after a frame; the elastic F and C stay as in `particles`.
+
+    Raises:
+        InputError: the trajectory has no such frame (where it is known; JAX would take the last one).
+    """
+    frames = trajectory.x.shape[0]
+    if isinstance(frame, int | np.integer) and not -frames <= frame < frames:
+        raise InputError(f"frame = {frame}: the trajectory has frames 0 to {frames - 1}.")
     return eqx.tree_at(
         lambda p: (p.x, p.v, p.F_visual),
         particles,

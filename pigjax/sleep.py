@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pigjax.boxes import Fit, devices_for
+from pigjax.checks import LARGEST_WHOLE, Limits, check_fields
 from pigjax.colliders import Collider
-from pigjax.errors import InputError
 from pigjax.matter import Grid, Health, Particles, SimConfig, Trajectory, perfect_health
 from pigjax.transfers import KERNELS
 
@@ -40,14 +40,14 @@ class Sleep:
         InputError: a number is out of range.
     """
 
-    speed: float = 0.01  # [cells per frame] that no particle of the body moves faster than
-    frames: int = 5  # in a row; more where free fall would not pass the speed in so few
+    # that no particle of the body moves faster than
+    speed: float = field(default=0.01, metadata={"limits": Limits(0, 1e3, above=True, unit="cells per frame")})
+    frames: int = field(
+        default=5, metadata={"limits": Limits(1, LARGEST_WHOLE)}
+    )  # in a row; more where free fall would not pass the speed in so few
 
     def __post_init__(self):
-        if not 0 < self.speed < math.inf:
-            raise InputError(f"Sleep.speed = {self.speed}: must be > 0 cells per frame, and finite.")
-        if self.frames < 1:
-            raise InputError(f"Sleep.frames = {self.frames}: must be 1 or more.")
+        check_fields(self)
 
 
 @dataclass(kw_only=True)

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 from pigjax.arrays import array_field, einsum, static_field
 from pigjax.bands import collect, spread
 from pigjax.camera import Camera, stack_cameras, to_camera
+from pigjax.checks import LARGEST_WHOLE, Limits, check_fields
 from pigjax.errors import InputError
 from pigjax.linalg import quat_to_matrix, safe_normalize, svd
 from pigjax.lists import BlendConfig, Projected, count_pairs, slots_of, tile_boxes
@@ -63,30 +64,42 @@ class Frame(eqx.Module):
 
 
 class RenderConfig(eqx.Module):
-    """Every approximation of the renderer, static."""
+    """Every approximation of the renderer, static.
 
-    tile_size: int = static_field(default=16)  # [px]
-    capacity: int | None = static_field(default=None)  # box/tile pairs listed per image; None: all, or see below
-    slots: int | None = static_field(default=None)  # of them sorted at once; None: 2¹⁷ on a CPU, 2²¹ elsewhere, / bands
-    sh_degree: int | None = static_field(default=None)  # None: all bands that the splats have
-    alpha_min: float = static_field(default=1 / 255)  # fainter contributions are skipped
-    alpha_max: float = static_field(default=0.99)
-    transmittance_min: float = static_field(default=1e-4)  # a pixel is closed before it falls below
-    dilation: float = static_field(default=0.3)  # added to the 2D covariance [px²]
+    Raises:
+        InputError: a number is not finite or out of range, or a choice does not exist.
+    """
+
+    tile_size: int = static_field(default=16, limits=Limits(1, 1024, unit="px"))
+    # box/tile pairs listed per image; None: all, or see below
+    capacity: int | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
+    # of them sorted at once; None: 2¹⁷ on a CPU, 2²¹ elsewhere, / bands
+    slots: int | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
+    sh_degree: int | None = static_field(default=None, limits=Limits(0, 3))  # None: all bands that the splats have
+    # fainter contributions are skipped
+    alpha_min: float = static_field(default=1 / 255, limits=Limits(0, 1, below=True))
+    alpha_max: float = static_field(default=0.99, limits=Limits(0, 1, above=True))
+    # a pixel is closed before it falls below
+    transmittance_min: float = static_field(default=1e-4, limits=Limits(0, 1, below=True))
+    dilation: float = static_field(default=0.3, limits=Limits(0, 1e6, unit="px²"))  # added to the 2D covariance
     antialias: bool = static_field(default=False)  # lower the opacity by what the dilation added
-    near: float = static_field(default=0.01)  # [m]
-    chunk: int | None = static_field(default=None)  # splats blended between two looks at a tile; None: 64, or 16 if few
-    tiles_at_once: int | None = static_field(default=None)  # walked together; None: 1 on a CPU, 2048 elsewhere
-    bands: int = static_field(default=1)  # local devices that share the image, each a band of rows
+    near: float = static_field(default=0.01, limits=Limits(0.0, 1e9, unit="m"))
+    # splats blended between two looks at a tile; None: 64, or 16 if few
+    chunk: int | None = static_field(default=None, limits=Limits(1, 1_000_000))
+    # walked together; None: 1 on a CPU, 2048 elsewhere
+    tiles_at_once: int | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
+    # local devices that share the image, each a band of rows
+    bands: int = static_field(default=1, limits=Limits(1, 4096))
     # "forward" goes through any mode and order (jvp, hessian), but is slower, and its lists have a static capacity: 16
     # pairs per splat unless given (`required_capacity` finds it); what does not fit is counted in Frame.overflow
-    differentiation: str = static_field(default="reverse")
+    differentiation: str = static_field(default="reverse", choices=("reverse", "forward"))
 
     def __check_init__(self):
-        if self.differentiation not in ("reverse", "forward"):
-            raise InputError(f"RenderConfig.differentiation = {self.differentiation!r}: choose reverse or forward.")
-        if self.bands < 1:
-            raise InputError(f"RenderConfig.bands = {self.bands}: one device or more must draw the image.")
+        check_fields(self)
+        if self.alpha_min >= self.alpha_max:
+            raise InputError(
+                f"RenderConfig.alpha_min = {self.alpha_min}: must be < alpha_max = {self.alpha_max}, or none is drawn."
+            )
 
 
 OUTPUTS = ("rgb", "alpha", "depth", "surface_depth", "object_weights", "normals", "features")

@@ -13,6 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "pigjax"
 # every module may import what stands on a lower floor only
 FLOORS = [
     {"errors", "arrays", "rewind"},
+    {"checks"},
     {"linalg", "krylov", "metrics", "lists"},
     {"camera", "materials", "bands", "footprints"},
     {"chunks"},

@@ -551,7 +551,7 @@ def test_a_traced_rollout_must_be_told_its_substeps():
 @pytest.mark.parametrize(
     ("choice", "message"),
     [
-        ({"kernel": "quartic"}, "choose one of quadratic, cubic"),
+        ({"kernel": "quartic"}, "hoose one of quadratic, cubic"),
         ({"integrator": "leapfrog"}, "choose one of explicit"),
         ({"walls": "rubber"}, "choose one of separate"),
         ({"substeps": 0}, "must be 1 or more"),

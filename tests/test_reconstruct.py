@@ -266,7 +266,7 @@ def test_every_kind_of_capture_gives_the_same_reconstruction(tmp_path, write):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"start_splats": 2}, "start_splats = 2, grow_every = 500: start with 4"),
+        ({"start_splats": 2}, "start_splats = 2: must be 4 or more"),
         (
             {"start_splats": 100, "splats": 15_000},
             r"doubles to 3200 of splats = 15000 within 3000 steps: lower grow_every",

@@ -44,8 +44,8 @@ BAD = {
     "unknown field": (values(simulation__frame=3), r"simulation\.frame: unknown field; did you mean 'frames'"),
     "unknown section": (values(simulatoin={}), r"simulatoin: unknown field; did you mean 'simulation'"),
     "unknown object field": (values(objects__ball={"material": "jelly", "yung": 1.0}), r"objects\.ball\.yung.*'young'"),
-    "wrong type": (values(simulation__dx="fine"), r"simulation\.dx: expected `float`, got `str`"),
-    "missing field": (values(simulation={"frames": 3}), r"simulation: object missing required field `dx`"),
+    "wrong type": (values(simulation__dx="fine"), r"simulation\.dx = 'fine': it must be a number"),
+    "missing field": (values(simulation={"frames": 3}), r"simulation\.dx is missing: give a number"),
     "not positive": (values(simulation__dx=-1.0), r"simulation\.dx = -1\.0: it must be > 0"),
     "unknown preset": (
         values(objects__ball={"material": "jely"}),
@@ -63,11 +63,11 @@ BAD = {
     "nothing moves": (values(objects={"table": {"id": 1, "fixed": True}}), r"objects: none moves"),
     "fixed with material": (
         values(objects={"a": {"material": "jelly"}, "b": {"fixed": True, "material": "metal"}}),
-        r"objects\.b: a fixed object has no material",
+        r"objects\.b\.material = 'metal': a fixed object has no material",
     ),
     "short vector": (
         values(objects__ball={"material": "jelly", "velocity": [1, 2]}),
-        r"velocity: expected `array` of length 3",
+        r"objects\.ball\.velocity = \[1, 2\]: it must be 3 numbers",
     ),
     "unknown collider field": (
         values(spheres__ball={"centre": [0, 0, 0], "radius": 1.0, "spin": 2.0}),
@@ -77,7 +77,7 @@ BAD = {
         values(cylinders__disc={"start": [0, 0, 0], "end": [0, 0, 1], "radius": 1.0, "angular_velocty": [0, 0, 1]}),
         r"cylinders\.disc\.angular_velocty.*'angular_velocity'",
     ),
-    "no radius": (values(capsules__rod={"start": [0, 0, 0], "end": [0, 0, 1]}), r"capsules.*missing.*`radius`"),
+    "no radius": (values(capsules__rod={"start": [0, 0, 0], "end": [0, 0, 1]}), r"capsules\.rod\.radius is missing"),
     "zero radius": (
         values(capsules__rod={"start": [0, 0, 0], "end": [0, 0, 1], "radius": 0}),
         r"capsules\.rod\.radius = 0\.0: it must be > 0 m",
@@ -88,7 +88,7 @@ BAD = {
     ),
     "endless spin": (
         values(boxes__crate={"lower": [0, 0, 0], "upper": [1, 1, 1], "angular_velocity": [0, 0, float("inf")]}),
-        r"boxes\.crate\.angular_velocity = .*inf.*must be finite",
+        r"boxes\.crate\.angular_velocity\[2\] = inf: it must be finite",
     ),
     "negative friction": (
         values(spheres__ball={"centre": [0, 0, 0], "radius": 1.0, "friction": -0.5}),
@@ -96,7 +96,7 @@ BAD = {
     ),
     "unknown mode": (
         values(spheres__ball={"centre": [0, 0, 0], "radius": 1.0, "mode": "bounce"}),
-        r"spheres.*mode: invalid enum value 'bounce'",
+        r"spheres\.ball\.mode = 'bounce': choose one of sticky, slip, separate",
     ),
 }
 
@@ -113,7 +113,7 @@ def test_missing_and_torn_files_are_clear_errors(tmp_path):
     with pytest.raises(MissingFileError, match=r"none\.toml: scene file does not exist"):
         load_scene(tmp_path / "none.toml")
     (tmp_path / "torn.toml").write_text("[input\n")
-    with pytest.raises(SceneError, match=r"torn\.toml: not valid TOML"):
+    with pytest.raises(SceneError, match=r"torn\.toml: not a readable TOML file"):
         load_scene(tmp_path / "torn.toml")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,7 +15,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from pigjax.arrays import as_array, static_field
+from pigjax.arrays import as_array, as_float, static_field
+from pigjax.checks import ANY, is_numeric, shown
 from pigjax.errors import InputError
 from pigjax.linalg import quat_multiply, quat_to_matrix, safe_norm, safe_normalize
 
@@ -30,7 +32,7 @@ def number(**kwargs: Any) -> Any:
 
 
 def _as_real(value):
-    value = jnp.asarray(value, float) if isinstance(value, int) else as_array(value)
+    value = jnp.asarray(as_float(value)) if isinstance(value, int) and not isinstance(value, bool) else as_array(value)
     return value.astype(float) if isinstance(value, Array) and jnp.issubdtype(value.dtype, jnp.integer) else value
 
 
@@ -79,12 +81,14 @@ class Collider(eqx.Module):
             raise InputError(f"mode = {self.mode!r}: choose one of {', '.join(MODES)}.")
         for field in dataclasses.fields(self):
             self.require(field.name, "its numbers must be finite", np.isfinite)
+            self.require(field.name, "its numbers must be at most 1e15", lambda v: np.abs(v) <= ANY.high)
         self.require("friction", "a collider's friction coefficient must be >= 0", lambda friction: friction >= 0)
         self.require("softness", "it must be > 0 m, or None for a hard contact", lambda width: width > 0)
-        self.require("rotation", "a quaternion must not be zero", lambda quat: (quat != 0).any(-1))
+        self.require("rotation", "a quaternion must not be zero", has_direction)
 
     def require(self, name: str, rule: str, holds: Callable[[Any], Any]) -> None:
         """Raise an InputError that names the field if its values are concrete and break the rule."""
+        self._check_types()
         value = getattr(self, name)
         if not isinstance(value, Array) or isinstance(value, jax.core.Tracer):
             return
@@ -92,6 +96,21 @@ class Collider(eqx.Module):
         if not isinstance(kept, jax.core.Tracer) and not np.all(kept):
             shown = value.tolist() if value.size <= 4 else f"array of {value.size} numbers"
             raise InputError(f"{name} = {shown}: {rule}.")
+
+    def _check_types(self) -> None:
+        """Whether every number is one, and every vector has its length: what the rules of subclasses stand on."""
+        for field in dataclasses.fields(self):
+            value, kind = getattr(self, field.name), str(field.type)
+            traced = isinstance(value, jax.core.Tracer)
+            if field.metadata.get("static", False) or (value is None and "None" in kind):
+                continue
+            if not traced and not is_numeric(value):
+                raise InputError(f"{field.name} = {shown(value)}: it must be a number, or an array of numbers.")
+            length = re.search(r"Array, .([0-9])", kind)
+            wanted = 3 if "nx ny nz" in kind else 0 if "Scalar" in kind else 1
+            if np.ndim(value) != wanted or (length is not None and np.shape(value) != (int(length[1]),)):
+                many = f"{length[1]} numbers" if length else f"an array of {wanted} axes" if wanted else "one number"
+                raise InputError(f"{field.name} = {shown(value)}: it must be {many}.")
 
     @abstractmethod
     def shape_distance(self, points: Points) -> Float[Array, "*n"]:
@@ -195,6 +214,11 @@ class Collider(eqx.Module):
             return self.velocity
         spin = jnp.cross(self.angular_velocity, points - self._pivot_at(time))
         return spin if self.velocity is None else self.velocity + spin
+
+
+def has_direction(vector: np.ndarray) -> Any:
+    """Whether a vector has a length that single precision can divide by."""
+    return np.square(vector, dtype=np.float64).sum(-1) > 1e-37
 
 
 def _quat_of_spin(vector):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pigjax.colliders.base import Collider, Points, Scalar, number
+from pigjax.colliders.base import Collider, Points, Scalar, has_direction, number
 from pigjax.linalg import safe_norm, safe_normalize
 
 
@@ -16,7 +16,7 @@ class Plane(Collider):
     normal: Float[Array, "3"] = number()  # out of the solid side, any length
 
     def __check_init__(self):
-        self.require("normal", "it must not be zero", lambda normal: (normal != 0).any(-1))
+        self.require("normal", "it must not be zero", has_direction)
 
     def shape_distance(self, points: Points) -> Float[Array, "*n"]:
         """Along the normal."""

@@ -2,10 +2,11 @@
 
 from pigjax.materials.laws import LAWS, Law, Response, respond
 from pigjax.materials.presets import PRESETS, preset
-from pigjax.materials.table import Material, MaterialTable, Parameters, material_table
+from pigjax.materials.table import LIMITS, Material, MaterialTable, Parameters, material_table
 
 __all__ = [
     "LAWS",
+    "LIMITS",
     "PRESETS",
     "Law",
     "Material",

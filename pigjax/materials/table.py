@@ -11,16 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from pigjax.arrays import as_array, static_field
+from pigjax.arrays import as_array, as_float, static_field
+from pigjax.checks import Limits, is_numeric, shown
 from pigjax.errors import InputError
 from pigjax.materials.laws import law_of
 
 
 def _number(**kwargs):
     """A number that a user may sweep: always an array, so that a new value never recompiles."""
-    return eqx.field(
-        converter=lambda v: jnp.asarray(v, float) if isinstance(v, int | float) else as_array(v), kw_only=True, **kwargs
-    )
+    return eqx.field(converter=_as_number, kw_only=True, **kwargs)
+
+
+def _as_number(value):
+    real = isinstance(value, int | float) and not isinstance(value, bool)
+    return jnp.asarray(as_float(value)) if real else as_array(value)
 
 
 class Parameters(eqx.Module):
@@ -70,45 +74,50 @@ class Material(Parameters):
     model: str = static_field()  # one of `materials.LAWS`
 
     def __check_init__(self):
+        if not isinstance(self.model, str):
+            raise InputError(f"model = {shown(self.model)}: it must be the name of a law.")
+        for number in fields(Parameters):
+            value = getattr(self, number.name)
+            if not isinstance(value, jax.core.Tracer) and not is_numeric(value):
+                raise InputError(f"{number.name} = {shown(value)}: {LIMITS[number.name][0]} must be a number.")
         needed = ("density", *law_of(self.model).needs)
-        for name, (limit, holds) in _LIMITS.items():
+        for name, (noun, limits) in LIMITS.items():
             value = getattr(self, name)
             if isinstance(value, jax.core.Tracer):
                 continue
             value = np.asarray(value)
             given = name in needed or np.any(value != 0)
-            if given and not np.all(np.isfinite(value) & holds(value)):
-                raise InputError(f"{name} = {value}: {limit} in a material of model {self.model!r}.")
+            rule = limits.broken(value) if given else None
+            if rule is not None:
+                raise InputError(f"{name} = {shown(value)}: {noun} {rule} in a material of model {self.model!r}.")
         for name, models, limit, holds in _JOINT_LIMITS:
             held = holds(self) if self.model in models else True
             if not isinstance(held, jax.core.Tracer) and not np.all(held):
-                raise InputError(f"{name} = {getattr(self, name)}: {limit} in a material of model {self.model!r}.")
+                raise InputError(
+                    f"{name} = {shown(getattr(self, name))}: {limit} in a material of model {self.model!r}."
+                )
 
 
-_LIMITS = {
-    "density": ("the density must be > 0 kg/m³", lambda v: v > 0),
-    "young": ("Young's modulus must be > 0 Pa", lambda v: v > 0),
-    "poisson": ("Poisson's ratio must be between -1 and 0.5, both excluded", lambda v: (v > -1) & (v < 0.5)),
-    "yield_stress": ("the yield stress must be > 0 Pa", lambda v: v > 0),
-    "hardening_modulus": ("the hardening modulus must be a number in Pa", lambda v: v == v),
-    "residual_stress": ("the residual yield stress must be >= 0 Pa", lambda v: v >= 0),
-    "friction_angle": (
-        "the friction angle must be between 0 and π/2 rad, both excluded",
-        lambda v: (v > 0) & (v < np.pi / 2),
-    ),
-    "cohesion": ("the cohesion must be >= 0 Pa", lambda v: v >= 0),
-    "bulk": ("the bulk modulus must be > 0 Pa (or give young and poisson)", lambda v: v > 0),
-    "viscosity": ("the viscosity must be >= 0 Pa s", lambda v: v >= 0),
-    "flow_exponent": ("the flow exponent must be between 0.1 and 10", lambda v: (v >= 0.1) & (v <= 10)),
-    "hardening_coefficient": ("the hardening coefficient must be >= 0", lambda v: v >= 0),
-    "critical_compression": (
-        "the critical compression must be between 0 and 1, both excluded",
-        lambda v: (v > 0) & (v < 1),
-    ),
-    "critical_stretch": ("the critical stretch must be > 0", lambda v: v > 0),
-    "fibre_stiffness": ("the stiffness of fibres must be > 0 Pa", lambda v: v > 0),
-    "fibre_azimuth": ("the azimuth of fibres must be an angle in rad", lambda v: v == v),
-    "fibre_elevation": ("the elevation of fibres must be an angle in rad", lambda v: v == v),
+# What each number is called, and its range where a law needs it or it is given.
+LIMITS: dict[str, tuple[str, Limits]] = {
+    "density": ("the density", Limits(0, 1e9, above=True, unit="kg/m³")),
+    "young": ("Young's modulus", Limits(0, above=True, unit="Pa")),
+    "poisson": ("Poisson's ratio", Limits(-1, 0.5, above=True, below=True)),
+    "yield_stress": ("the yield stress", Limits(0, above=True, unit="Pa")),
+    "hardening_modulus": ("the hardening modulus", Limits(unit="Pa")),
+    "residual_stress": ("the residual yield stress", Limits(0.0, unit="Pa")),
+    "friction_angle": ("the friction angle", Limits(0, np.pi / 2, above=True, below=True, unit="rad")),
+    "cohesion": ("the cohesion", Limits(0.0, unit="Pa")),
+    "bulk_modulus": ("the bulk modulus", Limits(0.0, unit="Pa")),
+    "bulk": ("the bulk modulus, given or from young and poisson,", Limits(0, above=True, unit="Pa")),
+    "viscosity": ("the viscosity", Limits(0.0, unit="Pa s")),
+    "flow_exponent": ("the flow exponent", Limits(0.1, 10.0)),
+    "hardening_coefficient": ("the hardening coefficient", Limits(0.0, 1e3)),
+    "critical_compression": ("the critical compression", Limits(0, 1, above=True, below=True)),
+    "critical_stretch": ("the critical stretch", Limits(0, 1e3, above=True)),
+    "fibre_stiffness": ("the stiffness of fibres", Limits(0, above=True, unit="Pa")),
+    "fibre_azimuth": ("the azimuth of fibres", Limits(-1e6, 1e6, unit="rad")),
+    "fibre_elevation": ("the elevation of fibres", Limits(-1e6, 1e6, unit="rad")),
 }
 # Laws, and what must hold between the numbers of one material.
 _JOINT_LIMITS = (

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 
 from pigjax.arrays import static_field
+from pigjax.checks import LARGEST_WHOLE, Limits, check_fields
 from pigjax.errors import InputError
 from pigjax.matter.state import WALL
 from pigjax.transfers import KERNELS
@@ -22,46 +23,44 @@ class SimConfig(eqx.Module):
         InputError: a choice does not exist or a number is out of range.
     """
 
-    kernel: str = static_field(default="quadratic")  # or "cubic": smoother, 2.4 times as many nodes
-    integrator: str = static_field(default="explicit")  # "implicit": waves do not limit its steps; or "auto"
-    substeps: int | None = static_field(default=None)  # per frame; None: the fewest that are stable
-    cfl: float = static_field(default=0.4)  # share of a cell that waves and particles cross in a step
-    walls: str = static_field(default="separate")  # of the domain: "separate", "slip" or "sticky"
-    visual_stretch: tuple[float, float] = static_field(default=(0.2, 5.0))  # bounds of F_visual's singular values
+    kernel: str = static_field(default="quadratic", choices=KERNELS)  # or "cubic": smoother, 2.4 times as many nodes
+    # "implicit": waves do not limit its steps; or "auto"
+    integrator: str = static_field(default="explicit", choices=_INTEGRATORS)
+    # per frame; None: the fewest that are stable
+    substeps: int | None = static_field(default=None, limits=Limits(1, 100_000_000))
+    # share of a cell that waves and particles cross in a step
+    cfl: float = static_field(default=0.4, limits=Limits(0, 1, above=True))
+    walls: str = static_field(default="separate", choices=_WALLS)  # of the domain: "separate", "slip" or "sticky"
+    # bounds of F_visual's singular values
+    visual_stretch: tuple[float, float] = static_field(default=(0.2, 5.0), limits=Limits(0, above=True))
     force: bool = static_field(default=False)  # run steps longer than the stable limit
     stop: bool = static_field(default=False)  # at the first bad frame: the rest repeats the last good one
-    newton_steps: int = static_field(default=30)  # of an implicit step, at most
-    newton_tolerance: float = static_field(default=1e-3)  # momentum out of balance, relative to what drives the step
-    krylov_steps: int = static_field(default=300)  # of a Newton step, at most
+    newton_steps: int = static_field(default=30, limits=Limits(1, 1_000_000))  # of an implicit step, at most
+    # momentum out of balance, relative to what drives the step
+    newton_tolerance: float = static_field(default=1e-3, limits=Limits(0, 1, above=True))
+    krylov_steps: int = static_field(default=300, limits=Limits(1, 1_000_000))  # of a Newton step, at most
     box: tuple[int, int, int] | None = static_field(default=None)  # nodes that move with matter in jit, grad and vmap
-    devices: int | None = static_field(default=None)  # that share the particles; None: all local ones, if it pays
-    differentiation: str = static_field(default="reverse")  # or "forward": for jvp, jacfwd and hessian
-    chunk: int | None = static_field(default=None)  # particles handled at once; None: 512 on a CPU, else all
+    # that share the particles; None: all local ones, if it pays
+    devices: int | None = static_field(default=None, limits=Limits(1, 100_000))
+    # or "forward": for jvp, jacfwd and hessian
+    differentiation: str = static_field(default="reverse", choices=_DIFFERENTIATION)
+    # particles handled at once; None: 512 on a CPU, else all
+    chunk: int | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
 
     def __check_init__(self):
-        for name, value, choices in (
-            ("kernel", self.kernel, KERNELS),
-            ("integrator", self.integrator, _INTEGRATORS),
-            ("walls", self.walls, _WALLS),
-            ("differentiation", self.differentiation, _DIFFERENTIATION),
-        ):
-            if value not in choices:
-                raise InputError(f"SimConfig.{name} = {value!r}: choose one of {', '.join(choices)}.")
-        if self.substeps is not None and self.substeps < 1:
-            raise InputError(f"SimConfig.substeps = {self.substeps}: must be 1 or more.")
+        check_fields(self)
         if self.box is not None and not (
-            isinstance(self.box, tuple) and len(self.box) == 3 and min(self.box) >= 2 * WALL + 2
+            isinstance(self.box, tuple)
+            and len(self.box) == 3
+            and all(isinstance(side, int) for side in self.box)
+            and min(self.box) >= 2 * WALL + 2
         ):
             raise InputError(f"SimConfig.box = {self.box}: give three sides of {2 * WALL + 2} nodes or more.")
-        if self.chunk is not None and self.chunk < 1:
-            raise InputError(f"SimConfig.chunk = {self.chunk}: must be 1 or more.")
-        if not 0 < self.visual_stretch[0] <= self.visual_stretch[1]:
+        if len(self.visual_stretch) != 2 or self.visual_stretch[0] > self.visual_stretch[1]:
             raise InputError(
                 f"SimConfig.visual_stretch = {self.visual_stretch}: the bounds must be > 0, the lower one first."
             )
-        if not self.cfl > 0:
-            raise InputError(f"SimConfig.cfl = {self.cfl}: must be > 0.")
-        if self.devices is not None and not 1 <= self.devices <= jax.local_device_count():
+        if self.devices is not None and self.devices > jax.local_device_count():
             raise InputError(
                 f"SimConfig.devices = {self.devices}: JAX has {jax.local_device_count()} local devices; on a CPU set"
                 f' jax.config.update("jax_num_cpu_devices", {self.devices}) before anything else.'

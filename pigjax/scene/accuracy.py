@@ -22,13 +22,9 @@ LEVELS: dict[str, Level] = {
 
 
 def with_level(values: dict[str, Any], level: str) -> dict[str, Any]:
-    """Values of a scene file with what the level sets; fields that the file gives stay, but for the scaled dx."""
-    coarsening, defaults = LEVELS[level]
+    """Values of a scene file with what the level sets; fields that the file gives stay."""
     filled = {**values, "accuracy": level}
-    for section, fields in defaults.items():
+    for section, fields in LEVELS[level].defaults.items():
         given = values.get(section, {})
         filled[section] = {**fields, **given} if isinstance(given, dict) else given
-    simulation = filled.get("simulation")
-    if coarsening != 1 and isinstance(simulation, dict) and type(simulation.get("dx")) in (int, float):
-        filled["simulation"] = {**simulation, "dx": simulation["dx"] * coarsening}
     return filled

@@ -12,13 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from pigjax import io
+from pigjax.checks import suggest
 from pigjax.editing import extract_object, hole_mask, remove_object
 from pigjax.errors import InputError
 from pigjax.io.files import existing
 from pigjax.overlay import id_colours, id_image, legend_sheet, overlay
 from pigjax.pruning import contributions
 from pigjax.scene.lifting import lift
-from pigjax.scene.schema import load_scene, suggest
+from pigjax.scene.schema import load_scene
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, render, sh_degree_of
 

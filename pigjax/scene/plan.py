@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from pigjax import io
 from pigjax.camera import Camera, orbit, stack_cameras
+from pigjax.checks import suggest
 from pigjax.clamp import ClampParams
 from pigjax.colliders import Collider
 from pigjax.contact import BodyContact
@@ -24,7 +25,7 @@ from pigjax.matter import Particles
 from pigjax.mls_mpm import SimConfig
 from pigjax.particles import Binding, bind, seed_particles
 from pigjax.scene.lifting import lift
-from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec, suggest
+from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec
 from pigjax.segmentation import Labels
 from pigjax.sleep import Sleep
 from pigjax.solids import collider_from_gaussians
@@ -75,6 +76,7 @@ def read_inputs(scene: Scene) -> Inputs:
     if spec.names is not None:
         known = {str(name): int(number) for number, name in io.read_json(scene.path(spec.names)).items()}
     ids = {name: _id_of(name, scene, known) for name in scene.objects}
+    _check_ids(ids)
     return Inputs(gaussians, views, ids, {number: name for name, number in known.items()})
 
 
@@ -86,6 +88,14 @@ def _id_of(name: str, scene: Scene, known: dict[str, int]) -> int:
         remedy = suggest(name, known) if known else f"give objects.{name}.id, or input.names"
         raise SceneError(f"objects.{name}: no object of that name in {scene.input.names or 'input.names'}; {remedy}.")
     return known[name]
+
+
+def _check_ids(ids: dict[str, int]) -> None:
+    """Each id belongs to one object, whether the scene gives it or its name is looked up."""
+    owners: dict[int, str] = {}
+    for name, number in ids.items():
+        if (owner := owners.setdefault(number, name)) != name:
+            raise SceneError(f"objects.{name}: its id {number} is that of objects.{owner}, too; give one id to each.")
 
 
 def segment(scene: Scene, inputs: Inputs) -> Labels:
@@ -100,9 +110,10 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
             raise SceneError("input.views is missing: several objects can be told apart by masks only.")
         (only,) = inputs.ids.values()
         count = len(inputs.gaussians)
-        return Labels(jnp.full(count, only, jnp.int32), jnp.zeros((count, only + 1), jnp.int32), jnp.ones(count))
+        return Labels(jnp.full(count, only, jnp.int32), jnp.zeros((count, 0), jnp.int32), jnp.ones(count))
     views = inputs.views.subset("train") if "train" in inputs.views.splits else inputs.views
     assert views.masks is not None
+    check_ids_occur(inputs.ids, views.masks)
     labels = lift(
         inputs.gaussians,
         views.cameras,
@@ -119,6 +130,20 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
             raise SceneError(f"objects.{name}: no Gaussian has its id {number} in the masks; check input.masks.")
     _warn_of_unnamed(inputs, np.flatnonzero(found[1:]) + 1)
     return labels
+
+
+def check_ids_occur(ids: dict[str, int], masks: Any) -> None:
+    """Whether the masks reach the ids of all objects: votes are counted up to the highest.
+
+    Raises:
+        SceneError: an id is higher than all of the masks.
+    """
+    highest = int(np.max(masks, initial=0))
+    for name, number in ids.items():
+        if number > highest:
+            raise SceneError(
+                f"objects.{name}: no pixel has its id {number}, the masks' highest is {highest}; check input.masks."
+            )
 
 
 def _warn_of_unnamed(inputs: Inputs, found: Int[np.ndarray, "k"]) -> None:

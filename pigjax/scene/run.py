@@ -220,13 +220,16 @@ def _draw_objects(
     inputs: Inputs, labels: Labels, camera: Camera, background: Any, image: np.ndarray, path: Path
 ) -> None:
     """The first frame with its objects tinted, and the legend below."""
-    count = int(np.max(labels.object_id)) + 1
-    membership = jax.nn.one_hot(labels.object_id, count)
+    object_id = np.asarray(labels.object_id)
+    occurring = np.unique(np.maximum(object_id, 0))
+    occurring = occurring if occurring[0] == 0 else np.concatenate([[0], occurring])
+    # memory goes by the ids that occur; the unseen, -1, are of none
+    membership = jnp.where(object_id[:, None] < 0, 0.0, object_id[:, None] == occurring)
     frame = render(
         inputs.gaussians, camera, outputs=("object_weights",), object_weights=membership, background=background
     )
     assert frame.object_weights is not None
-    ids = id_image(frame.object_weights)
+    ids = occurring[np.asarray(id_image(frame.object_weights))]
     names = {number: name for name, number in inputs.ids.items()}
     tinted = overlay(image, ids)
     legend = legend_sheet(names, image=image, ids=ids, width=tinted.shape[1])

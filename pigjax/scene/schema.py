@@ -1,127 +1,159 @@
-"""The scene file: what it may say, decoded and checked by msgspec, every error named by field, value and remedy."""
+"""The scene file: what it may say, with the range of every number; errors name field, value and remedy."""
 
 from __future__ import annotations
 
-import difflib
-import re
-import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-import msgspec
-from msgspec import Struct
-from msgspec.structs import asdict
+from msgspec import field
+from msgspec.structs import asdict, replace
 
+from pigjax import io
+from pigjax.checks import LARGEST_WHOLE, Limits, joined, shown, suggest
 from pigjax.colliders import Box, Capsule, Collider, Cylinder, Plane, Sphere
 from pigjax.errors import InputError, MissingFileError, SceneError
-from pigjax.materials import PRESETS, Material, Parameters
+from pigjax.materials import LAWS, PRESETS, Material, Parameters
 from pigjax.scene.accuracy import LEVELS, Accuracy, with_level
+from pigjax.scene.decode import Section, decode
 
 Triple = tuple[float, float, float]
-_NUMBERS = tuple(field.name for field in fields(Parameters))
+_NUMBERS = tuple(number.name for number in fields(Parameters))
+_PLACE = Limits(-1e9, 1e9, unit="m")
+_LENGTH = Limits(0, 1e9, above=True, unit="m")
+_SPEED = Limits(-1e6, 1e6, unit="m/s")
+_ANGLE = Limits(-1e6, 1e6, unit="degrees")
+_PIXELS = Limits(1, 16384, unit="px")
+_WEIGHT = Limits(-1e3, 1e3)
+_FRICTION = Limits(0, 1e6)
 
 
-class InputSpec(Struct, forbid_unknown_fields=True, frozen=True):
+class InputSpec(Section, frozen=True):
     """Where the scene comes from; paths are relative to the scene file."""
 
     gaussians: str  # trained .ply
     views: str | None = None  # posed photos, which the masks belong to
     masks: str | None = None  # folder of instance masks; None: `object_mask` beside the photos
     names: str | None = None  # JSON of mask ids and names
-    max_size: int | None = None  # [px]
+    max_size: Annotated[int, Limits(1, 65536, unit="px")] | None = None  # of the photos' longer side
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"  # axis of the world that points up
 
+    def rules(self) -> Iterable[tuple[str, bool, str]]:
+        """Masks belong to views."""
+        yield "masks", self.masks is None or self.views is not None, "masks belong to photos; give input.views, too"
 
-class SegmentationSpec(Struct, forbid_unknown_fields=True, frozen=True):
+
+class SegmentationSpec(Section, frozen=True):
     """Thresholds of the vote (paper 3.2)."""
 
-    tau_T: float = 0.5
-    tau_d: float = 0.03
+    tau_T: Annotated[float, Limits(0, 1)] = 0.5
+    tau_d: Annotated[float, Limits(0, 1)] = 0.03
     background: Literal["ignore", "vote"] = "ignore"
     fill_unseen: bool = True  # unseen Gaussians take the id of their neighbours
 
 
-class SimulationSpec(Struct, forbid_unknown_fields=True, frozen=True):
+class SimulationSpec(Section, frozen=True):
     """The simulation, in SI units."""
 
-    dx: float  # grid spacing [m]
-    frames: int = 48
-    fps: float = 24.0
-    gravity: float | Triple = 9.81  # downwards, or a vector [m/s²]
-    slow_motion: float = 1.0  # simulated time is shown this many times slower
-    particles_per_cell: float = 8.0
+    dx: Annotated[float, _LENGTH]  # grid spacing
+    frames: Annotated[int, Limits(1, 100_000)] = 48
+    fps: Annotated[float, Limits(0, 1e4, above=True, unit="1/s")] = 24.0
+    gravity: Annotated[float | Triple, Limits(-1e6, 1e6, unit="m/s²")] = 9.81  # downwards, or a vector
+    slow_motion: Annotated[float, Limits(0, 1e9, above=True)] = 1.0  # simulated time is shown this many times slower
+    particles_per_cell: Annotated[float, Limits(0, 1e4, above=True)] = 8.0
     fill: bool = True  # fill objects inside
-    cfl: float = 0.4
-    kernel: str = "quadratic"
+    cfl: Annotated[float, Limits(0, 1, above=True)] = 0.4
+    kernel: Literal["quadratic", "cubic"] = "quadratic"
     integrator: Literal["explicit", "implicit", "auto"] = "explicit"
-    contact_friction: float | None = None  # of objects on each other, which then never fuse; None: one common field
-    sleep: float | None = None  # objects slower than this are left out until touched [cells/frame]; None: never
-    seed: int = 0
+    # of objects on each other, which then never fuse; None: one common field
+    contact_friction: Annotated[float, _FRICTION] | None = None
+    # objects slower than this are left out until touched; None: never
+    sleep: Annotated[float, Limits(0, 1e3, above=True, unit="cells/frame")] | None = None
+    seed: Annotated[int, Limits(0, LARGEST_WHOLE)] = 0
 
 
-class ClampSpec(Struct, forbid_unknown_fields=True, frozen=True):
+class ClampSpec(Section, frozen=True):
     """The adaptive eigen-clamp (paper 3.3)."""
 
     mode: Literal["aligned", "literal", "covariance", "fixed"] = "aligned"
-    tau_min: float = 0.5
-    tau_max: float = 2.0
-    lambda_R: float = 1.2
-    lambda_S: float = 0.8
+    tau_min: Annotated[float, Limits(0, 1e9)] = 0.5
+    tau_max: Annotated[float, Limits(0, 1e9, above=True)] = 2.0
+    lambda_R: Annotated[float, _WEIGHT] = 1.2
+    lambda_S: Annotated[float, _WEIGHT] = 0.8
     relative: bool = True
 
+    def rules(self) -> Iterable[tuple[str, bool, str]]:
+        """Bounds are in order."""
+        yield "tau_min", self.tau_min <= self.tau_max, f"it must not be above clamp.tau_max = {self.tau_max}"
 
-class CameraSpec(Struct, forbid_unknown_fields=True, frozen=True):
+
+class CameraSpec(Section, frozen=True):
     """From where the video is drawn: a view of the capture, or an orbit."""
 
     view: str | None = None  # name of a photo whose camera is taken
-    target: Triple | None = None  # centre of the orbit [m]; None: middle of the moving objects
-    radius: float | None = None  # [m]
-    elevation: float = 30.0  # [degrees]
-    start: float = 0.0  # azimuth of the first frame [degrees]
-    sweep: float = 0.0  # azimuth covered by the video [degrees]
-    field_of_view: float = 45.0  # horizontal [degrees]
-    width: int = 512  # [px]
-    height: int = 512
-    background: float | Triple = 0.0
+    target: Annotated[Triple, _PLACE] | None = None  # centre of the orbit; None: middle of the moving objects
+    radius: Annotated[float, _LENGTH] | None = None
+    elevation: Annotated[float, Limits(-90, 90, unit="degrees")] = 30.0
+    start: Annotated[float, _ANGLE] = 0.0  # azimuth of the first frame
+    sweep: Annotated[float, _ANGLE] = 0.0  # azimuth covered by the video
+    field_of_view: Annotated[float, Limits(0, 180, above=True, below=True, unit="degrees")] = 45.0  # horizontal
+    width: Annotated[int, _PIXELS] = 512
+    height: Annotated[int, _PIXELS] = 512
+    background: Annotated[float | Triple, Limits(0, 1)] = 0.0
+
+    def rules(self) -> Iterable[tuple[str, bool, str]]:
+        """A photo's camera has a place of its own."""
+        orbits = self.target is not None or self.radius is not None
+        yield "view", self.view is None or not orbits, "a photo's camera has a place; remove target and radius, or view"
 
 
-class DrawingSpec(Struct, forbid_unknown_fields=True, frozen=True):
+class DrawingSpec(Section, frozen=True):
     """How exactly the video is drawn; see `RenderConfig`."""
 
-    scale: float = 1.0  # of the video's width and height: 0.5 draws a quarter of the pixels
-    sh_degree: int | None = None  # bands of view-dependent colour; None: all
-    alpha_min: float = 1 / 255  # fainter contributions are skipped
-    transmittance_min: float = 1e-4  # a pixel is closed before it falls below
+    # of the video's width and height: 0.5 draws a quarter of the pixels
+    scale: Annotated[float, Limits(0, 16, above=True)] = 1.0
+    sh_degree: Annotated[int, Limits(0, 3)] | None = None  # bands of view-dependent colour; None: all
+    alpha_min: Annotated[float, Limits(0, 1, below=True)] = 1 / 255  # fainter contributions are skipped
+    transmittance_min: Annotated[float, Limits(0, 1, below=True)] = 1e-4  # a pixel is closed before it falls below
 
 
-class ObjectSpec(Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """One object: its material by preset, by law and numbers, or a preset with some numbers changed."""
+class ObjectSpec(Section, frozen=True, kw_only=True):
+    """One object: its material by preset, by law and numbers, or a preset with some numbers changed.
 
-    id: int | None = None  # id in the masks; None: looked up by the object's name
+    The ranges of a material's numbers are those of its law: see `materials.LIMITS`.
+    """
+
+    id: Annotated[int, Limits(0, 65535)] | None = None  # in the masks; None: looked up by the object's name
     fixed: bool = False  # a still collider made from its own splats
-    friction: float = 0.5  # Coulomb's coefficient of a fixed object
+    friction: Annotated[float, _FRICTION] = 0.5  # Coulomb's coefficient of a fixed object
     material: str | None = None
     model: str | None = None
-    velocity: Triple = (0.0, 0.0, 0.0)  # [m/s]
-    density: float | None = None
-    young: float | None = None
-    poisson: float | None = None
-    yield_stress: float | None = None
-    hardening_modulus: float | None = None
-    residual_stress: float | None = None
-    friction_angle: float | None = None  # [rad]
-    cohesion: float | None = None
-    bulk_modulus: float | None = None
-    viscosity: float | None = None
-    flow_exponent: float | None = None
-    hardening_coefficient: float | None = None
-    critical_compression: float | None = None
-    critical_stretch: float | None = None
-    fibre_stiffness: float | None = None
-    fibre_azimuth: float | None = None  # [rad]
-    fibre_elevation: float | None = None
+    velocity: Annotated[Triple, _SPEED] = (0.0, 0.0, 0.0)
+    density: Annotated[float, Limits(unit="kg/m³")] | None = None
+    young: Annotated[float, Limits(unit="Pa")] | None = None
+    poisson: Annotated[float, Limits()] | None = None
+    yield_stress: Annotated[float, Limits(unit="Pa")] | None = None
+    hardening_modulus: Annotated[float, Limits(unit="Pa")] | None = None
+    residual_stress: Annotated[float, Limits(unit="Pa")] | None = None
+    friction_angle: Annotated[float, Limits(unit="rad")] | None = None
+    cohesion: Annotated[float, Limits(unit="Pa")] | None = None
+    bulk_modulus: Annotated[float, Limits(unit="Pa")] | None = None
+    viscosity: Annotated[float, Limits(unit="Pa s")] | None = None
+    flow_exponent: Annotated[float, Limits()] | None = None
+    hardening_coefficient: Annotated[float, Limits()] | None = None
+    critical_compression: Annotated[float, Limits()] | None = None
+    critical_stretch: Annotated[float, Limits()] | None = None
+    fibre_stiffness: Annotated[float, Limits(unit="Pa")] | None = None
+    fibre_azimuth: Annotated[float, Limits(unit="rad")] | None = None
+    fibre_elevation: Annotated[float, Limits(unit="rad")] | None = None
+
+    def rules(self) -> Iterable[tuple[str, bool, str]]:
+        """A fixed object neither moves nor has a material."""
+        if self.fixed:
+            for name in ("material", "model", *_NUMBERS):
+                yield name, getattr(self, name) is None, "a fixed object has no material; remove one of the two"
+            yield "velocity", not any(self.velocity), "a fixed object does not move; remove one of the two"
 
     def to_material(self, name: str) -> Material:
         """The material that it says.
@@ -129,10 +161,12 @@ class ObjectSpec(Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
         Raises:
             SceneError: no material, an unknown one, or numbers out of range.
         """
+        name = joined(name)
         if (self.material is None) == (self.model is None):
             raise SceneError(f"objects.{name}: give either material (a preset) or model (a law with its numbers).")
-        if self.material is not None and self.material not in PRESETS:
-            raise SceneError(f"objects.{name}.material = {self.material!r}: {suggest(self.material, PRESETS)}.")
+        for key, value, known in (("material", self.material, PRESETS), ("model", self.model, LAWS)):
+            if value is not None and value not in known:
+                raise SceneError(f"objects.{name}.{key} = {value!r}: {suggest(value, known)}.")
         settings: dict[str, Any] = dict(PRESETS[self.material]) if self.material else {"model": self.model}
         settings |= {key: value for key in _NUMBERS if (value := getattr(self, key)) is not None}
         if "density" not in settings:
@@ -143,15 +177,15 @@ class ObjectSpec(Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
             raise SceneError(f"objects.{name}.{error}") from None
 
 
-class ColliderSpec(Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+class ColliderSpec(Section, frozen=True, kw_only=True):
     """What all colliders may say: how they touch, stand and move; the numbers of `Collider`."""
 
-    friction: float = 0.5
+    friction: Annotated[float, _FRICTION] = 0.5
     mode: Literal["sticky", "slip", "separate"] = "separate"
-    velocity: Triple | None = None  # [m/s]
-    angular_velocity: Triple | None = None  # [rad/s]
-    rotation: tuple[float, float, float, float] | None = None  # quaternion wxyz
-    pivot: Triple | None = None  # what it turns about [m]; None: its middle
+    velocity: Annotated[Triple, _SPEED] | None = None
+    angular_velocity: Annotated[Triple, Limits(-1e6, 1e6, unit="rad/s")] | None = None
+    rotation: Annotated[tuple[float, float, float, float], _WEIGHT] | None = None  # quaternion wxyz
+    pivot: Annotated[Triple, _PLACE] | None = None  # what it turns about; None: its middle
     shape: ClassVar[type[Collider]]
 
     def to_collider(self, where: str) -> Collider:
@@ -169,46 +203,46 @@ class ColliderSpec(Struct, forbid_unknown_fields=True, frozen=True, kw_only=True
 class PlaneSpec(ColliderSpec, frozen=True, kw_only=True):
     """A half space that matter cannot enter."""
 
-    point: Triple  # [m]
-    normal: Triple
+    point: Annotated[Triple, _PLACE]
+    normal: Annotated[Triple, _WEIGHT]
     shape = Plane
 
 
 class BoxSpec(ColliderSpec, frozen=True, kw_only=True):
     """A solid box, along the axes unless turned."""
 
-    lower: Triple  # [m]
-    upper: Triple
+    lower: Annotated[Triple, _PLACE]
+    upper: Annotated[Triple, _PLACE]
     shape = Box
 
 
 class SphereSpec(ColliderSpec, frozen=True, kw_only=True):
     """A solid ball."""
 
-    centre: Triple  # [m]
-    radius: float
+    centre: Annotated[Triple, _PLACE]
+    radius: Annotated[float, _LENGTH]
     shape = Sphere
 
 
 class CapsuleSpec(ColliderSpec, frozen=True, kw_only=True):
     """A solid rod with round ends about two points of its axis."""
 
-    start: Triple  # [m]
-    end: Triple
-    radius: float
+    start: Annotated[Triple, _PLACE]
+    end: Annotated[Triple, _PLACE]
+    radius: Annotated[float, _LENGTH]
     shape = Capsule
 
 
 class CylinderSpec(ColliderSpec, frozen=True, kw_only=True):
     """A solid cylinder with flat ends in two points of its axis."""
 
-    start: Triple  # [m]
-    end: Triple
-    radius: float
+    start: Annotated[Triple, _PLACE]
+    end: Annotated[Triple, _PLACE]
+    radius: Annotated[float, _LENGTH]
     shape = Cylinder
 
 
-class Scene(Struct, forbid_unknown_fields=True, frozen=True):
+class Scene(Section, frozen=True):
     """A whole scene file."""
 
     input: InputSpec
@@ -219,12 +253,22 @@ class Scene(Struct, forbid_unknown_fields=True, frozen=True):
     camera: CameraSpec = CameraSpec()
     drawing: DrawingSpec = DrawingSpec()
     accuracy: Accuracy = "standard"  # sets at once what the file leaves open, and scales its dx; see `accuracy`
-    planes: dict[str, PlaneSpec] = {}
-    boxes: dict[str, BoxSpec] = {}
-    spheres: dict[str, SphereSpec] = {}
-    capsules: dict[str, CapsuleSpec] = {}
-    cylinders: dict[str, CylinderSpec] = {}
+    planes: dict[str, PlaneSpec] = field(default_factory=dict)
+    boxes: dict[str, BoxSpec] = field(default_factory=dict)
+    spheres: dict[str, SphereSpec] = field(default_factory=dict)
+    capsules: dict[str, CapsuleSpec] = field(default_factory=dict)
+    cylinders: dict[str, CylinderSpec] = field(default_factory=dict)
     folder: str = "."  # set by `load_scene`; what relative paths start from
+
+    def rules(self) -> Iterable[tuple[str, bool, str]]:
+        """Something moves, and each id belongs to one object."""
+        yield "objects", not all(spec.fixed for spec in self.objects.values()), "none moves; give one a material"
+        owners: dict[int, str] = {}
+        for name, spec in self.objects.items():
+            if spec.id is not None:
+                owner = owners.setdefault(spec.id, name)
+                rule = f"{spec.id} is the id of objects.{joined(owner)}, too; each object has an id of its own"
+                yield joined("objects", name, "id"), owner == name, rule
 
     def path(self, name: str) -> Path:
         """A path of the file, seen from the working directory."""
@@ -238,17 +282,13 @@ class Scene(Struct, forbid_unknown_fields=True, frozen=True):
         """
         sections = {section: getattr(self, section) for section in _COLLIDERS}
         return tuple(
-            spec.to_collider(f"{section}.{name}") for section, specs in sections.items() for name, spec in specs.items()
+            spec.to_collider(joined(section, name))
+            for section, specs in sections.items()
+            for name, spec in specs.items()
         )
 
 
-_COLLIDERS = {
-    "planes": PlaneSpec,
-    "boxes": BoxSpec,
-    "spheres": SphereSpec,
-    "capsules": CapsuleSpec,
-    "cylinders": CylinderSpec,
-}
+_COLLIDERS = ("planes", "boxes", "spheres", "capsules", "cylinders")
 
 
 def load_scene(path: str | Path, *, accuracy: str | None = None) -> Scene:
@@ -264,13 +304,22 @@ def load_scene(path: str | Path, *, accuracy: str | None = None) -> Scene:
             is out of range.
     """
     path = Path(path)
+    return scene_from(read_file(path, "scene file"), folder=path.parent, where=str(path), accuracy=accuracy)
+
+
+def read_file(path: Path, what: str) -> dict[str, Any]:
+    """Values of a scene or study file.
+
+    Raises:
+        MissingFileError: there is no such file.
+        SceneError: it is not TOML.
+    """
     if not path.is_file():
-        raise MissingFileError(f"{path}: scene file does not exist; check the path.")
+        raise MissingFileError(f"{path}: {what} does not exist; check the path.")
     try:
-        values = tomllib.loads(path.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SceneError(f"{path}: not valid TOML: {error}.") from None
-    return scene_from(values, folder=path.parent, where=str(path), accuracy=accuracy)
+        return io.read_toml(path)
+    except InputError as error:
+        raise SceneError(str(error)) from error
 
 
 def scene_from(
@@ -285,82 +334,15 @@ def scene_from(
     """
     level = values.get("accuracy", "standard") if accuracy is None else accuracy
     if not isinstance(level, str) or level not in LEVELS:
-        raise SceneError(f"{where}: accuracy = {level!r}: {suggest(str(level), LEVELS)}.")
-    values = with_level(values, level)
+        raise SceneError(f"{where}: accuracy = {shown(level)}: {suggest(level, LEVELS)}.")
     try:
-        scene = msgspec.convert({**values, "folder": str(folder)}, Scene)
-    except msgspec.ValidationError as error:
-        raise SceneError(f"{where}: {explain(str(error), values, _fields_at)}") from None
-    _check(scene, where)
+        scene = decode(with_level(values, level), Scene, folder=str(folder))
+        dx = scene.simulation.dx * LEVELS[level].coarsening
+        scene = replace(scene, simulation=replace(scene.simulation, dx=dx))
+        for name, spec in scene.objects.items():
+            if not spec.fixed:
+                spec.to_material(name)
+        scene.colliders()
+    except SceneError as error:
+        raise SceneError(f"{where}: {error}") from error.__cause__
     return scene
-
-
-def _check(scene: Scene, where: str) -> None:
-    positive = {
-        "simulation.dx": scene.simulation.dx,
-        "simulation.frames": scene.simulation.frames,
-        "simulation.fps": scene.simulation.fps,
-        "simulation.slow_motion": scene.simulation.slow_motion,
-        "simulation.particles_per_cell": scene.simulation.particles_per_cell,
-        "simulation.cfl": scene.simulation.cfl,
-        "camera.width": scene.camera.width,
-        "camera.height": scene.camera.height,
-        "camera.field_of_view": scene.camera.field_of_view,
-        "drawing.scale": scene.drawing.scale,
-    }
-    if scene.simulation.sleep is not None:
-        positive["simulation.sleep"] = scene.simulation.sleep
-    for name, value in positive.items():
-        if not 0 < value < float("inf"):
-            raise SceneError(f"{where}: {name} = {value}: it must be > 0.")
-    for name in ("alpha_min", "transmittance_min"):
-        low = getattr(scene.drawing, name)
-        if not 0 <= low < 1:
-            raise SceneError(f"{where}: drawing.{name} = {low}: it must lie in [0, 1).")
-    if scene.drawing.sh_degree not in (None, 0, 1, 2, 3):
-        raise SceneError(f"{where}: drawing.sh_degree = {scene.drawing.sh_degree}: choose 0, 1, 2 or 3.")
-    moving = [name for name, spec in scene.objects.items() if not spec.fixed]
-    if not moving:
-        raise SceneError(f"{where}: objects: none moves; give at least one a material.")
-    for name in moving:
-        scene.objects[name].to_material(name)
-    for name, spec in scene.objects.items():
-        if spec.fixed and (spec.material or spec.model):
-            raise SceneError(f"{where}: objects.{name}: a fixed object has no material; remove one of the two.")
-    scene.colliders()
-
-
-def explain(message: str, values: dict[str, Any], fields_at: Callable[[str], Sequence[str]]) -> str:
-    """msgspec's message with the place first and, for an unknown field, the nearest right name.
-
-    Args:
-        message: of the validation error.
-        values: what was to be decoded.
-        fields_at: names of the fields of a place such as "objects.duck".
-    """
-    place = re.search(r" - at `(key in )?\$\.?([^`]*)`$", message)
-    at = place.group(2).replace("[...]", "") if place else ""
-    message = re.sub(r" - at `.*`$", "", message)
-    unknown = re.search(r"unknown field `([^`]*)`", message)
-    if unknown is None:
-        return f"{at or 'top level'}: {message[0].lower()}{message[1:]}."
-    name = unknown.group(1)
-    known = fields_at(at)
-    table = values.get(at.split(".")[0], {})
-    if isinstance(table, dict) and name not in table:  # msgspec does not say in which entry
-        at = next((f"{at}.{key}" for key, entry in table.items() if isinstance(entry, dict) and name in entry), at)
-    return f"{at + '.' if at else ''}{name}: unknown field; {suggest(name, known)}."
-
-
-def _fields_at(place: str) -> tuple[str, ...]:
-    structs = {"": Scene, "objects": ObjectSpec, **_COLLIDERS}
-    structs |= {"input": InputSpec, "segmentation": SegmentationSpec, "simulation": SimulationSpec}
-    structs |= {"clamp": ClampSpec, "camera": CameraSpec, "drawing": DrawingSpec}
-    fields = structs.get(place.split(".")[0], Scene).__struct_fields__
-    return tuple(name for name in fields if name != "folder")
-
-
-def suggest(name: str, known) -> str:
-    """The nearest right name, or all of them."""
-    near = difflib.get_close_matches(name, list(known), 1)
-    return f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(known)}"

@@ -23,6 +23,7 @@ from scipy.cluster.vq import kmeans2
 
 from pigjax.boxes import box_for
 from pigjax.camera import Camera
+from pigjax.checks import suggest
 from pigjax.clamp import ClampParams
 from pigjax.colliders import Collider
 from pigjax.contact import BodyContact
@@ -32,7 +33,7 @@ from pigjax.matter import Grid, Health, Particles, Trajectory, fit_grid, vast_gr
 from pigjax.mls_mpm import SimConfig, choose_integrator, choose_substeps, rollout, stable_dt
 from pigjax.particles import Binding, at_frame, deform
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, render_config, segment
-from pigjax.scene.schema import Scene, suggest
+from pigjax.scene.schema import Scene
 from pigjax.splat import Gaussians, RenderConfig, Splats, render
 
 _NUMBERS = tuple(field.name for field in fields(Parameters))
@@ -192,6 +193,7 @@ class Experiment(eqx.Module):
 
     def _with(self, name: str, value: Array) -> Experiment:
         section, entry, field = self._split(name)
+        self._check_shape(name, value)
         change: dict[str, Any] = {field: value}
         if section == "clamp":
             return replace(self, clamp=replace(self.clamp, **change))
@@ -211,6 +213,18 @@ class Experiment(eqx.Module):
             mass = particles.volume0 * table.density[particles.material]
             particles = replace(particles, mass=mass.astype(particles.mass.dtype))
         return replace(self, table=table, particles=particles)
+
+    def _check_shape(self, name: str, value: Array) -> None:
+        """Whether a value is one number for all, or as many as the parameter has."""
+        section, entry, field = self._split(name)
+        solid = f"{section}.{entry}" in self.solids
+        if solid and getattr(self.colliders[self.solids.index(f"{section}.{entry}")], field) is None:
+            return
+        wanted = self.value(name).shape
+        spread = value.ndim == 0 and not solid
+        if not spread and value.shape != wanted:
+            needed = f"shape {wanted}" if wanted else "one number"
+            raise SceneError(f"parameter {name}: its value has shape {value.shape}; {needed} is needed.")
 
     def _with_simulation(self, field: str, value: Array) -> Experiment:
         if self.contact is not None and field == "contact_friction":
@@ -314,6 +328,8 @@ def _split_object(made: Experiment, name: str, count: int) -> Experiment:
     (row,) = known[name]
     material = np.array(made.particles.material)
     mine = np.flatnonzero(material == row)
+    if not 1 <= count <= len(mine):
+        raise SceneError(f"regions.{name} = {count}: it must be in [1, {len(mine)}], the object's particles.")
     _, part = kmeans2(np.asarray(made.particles.x, np.float64)[mine], count, minit="++", seed=0)
     _, part = np.unique(part, return_inverse=True)  # k-means may leave a part empty
     rows = np.array([row, *range(len(made.table), len(made.table) + part.max())])

@@ -6,7 +6,10 @@ One of them named "loss" is what tuning makes small. Where the simulation broke 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
+import inspect
+import traceback
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,11 +21,12 @@ from jaxtyping import Array, Float
 
 from pigjax import io
 from pigjax.arrays import matmul
+from pigjax.checks import joined, shown, suggest
 from pigjax.errors import InputError, MissingFileError, SceneError
 from pigjax.linalg import svd
 from pigjax.metrics import psnr
-from pigjax.scene.schema import suggest
 from pigjax.study.experiment import Outcome
+from pigjax.study.schema import ObjectiveSpec
 
 Scores = dict[str, Float[Array, ""]]
 Objective = Callable[[Outcome], Scores]
@@ -44,15 +48,35 @@ def aim(outcome: Outcome, *, object: str, target: Any, frame: int = -1) -> Score
     """How far an object's middle is from a target [m] after a frame; the loss is the square of it.
 
     Axes of the target that are NaN do not count.
+
+    Raises:
+        SceneError: no such moving object or frame, or the target is not 3 numbers.
     """
     rows = dict(outcome.experiment.rows)
-    if object not in rows:
-        raise SceneError(f"objective.options.object = {object!r}: {suggest(object, rows)}.")
+    check_aim(object, frame, rows, outcome.experiment.frames)
     middle = matmul(_share(outcome, rows[object]), outcome.trajectory.x[frame])
     wanted = np.asarray(target, float)
+    if wanted.shape != (3,):
+        raise SceneError(f"objective.options.target = {shown(target)}: it must be 3 numbers.")
     off = jnp.where(np.isnan(wanted), 0.0, middle - np.nan_to_num(wanted))
     squared = jnp.sum(off**2)
     return {"loss": squared, "distance": jnp.sqrt(squared)} | {f"{axis}": middle[k] for k, axis in enumerate("xyz")}
+
+
+def check_aim(object: str, frame: int, objects: Iterable[str], frames: int) -> None:
+    """Whether there are such an object and such a frame.
+
+    JAX would take the last frame in place of one beyond it.
+
+    Raises:
+        SceneError: there is none.
+    """
+    if object not in objects:
+        raise SceneError(f"objective.options.object = {shown(object)}: {suggest(object, objects)}.")
+    if not -frames <= frame < frames:
+        raise SceneError(
+            f"objective.options.frame = {frame}: it must be in [0, {frames - 1}], or -1 to -{frames} from the end."
+        )
 
 
 def shape(outcome: Outcome, *, aspect: float = 10.0, stretch: float = 3.0) -> Scores:
@@ -119,26 +143,45 @@ def objective_of(function: str, options: dict[str, Any], folder: Path) -> Object
 
     Raises:
         MissingFileError: there is no such file.
-        SceneError: there is no such objective or function.
+        SceneError: there is no such objective or function, or an option is unknown, missing or wrong.
+        InputError: the file's code fails.
     """
+    spec = ObjectiveSpec(function, dict(options))
+    spec.check()
     options = dict(options)
-    if function == "video":
-        options["target"] = _read_target(folder, options.pop("target", None))
-    if function in OBJECTIVES:
-        found = OBJECTIVES[function]
-    elif ".py:" in function:
+    if spec.is_code():
         file, _, name = function.rpartition(":")
         found = _from_file(folder / file, name)
+        _check_options(found, options, function)
+    elif function not in OBJECTIVES:
+        raise SceneError(f"objective.function = {function!r}: it scores thresholds of the vote, segmentation.*, only.")
     else:
-        names = (*OBJECTIVES, "file.py:function")
-        raise SceneError(f"objective.function = {function!r}: {suggest(function, names)}.")
+        found = OBJECTIVES[function]
+    if function == "video":
+        options["target"] = _read_target(folder, options["target"])
     return partial(_healthy, partial(found, **options))
 
 
 def _healthy(objective: Objective, outcome: Outcome) -> Scores:
     health = outcome.health
     broken = (health.nonfinite > 0) | (health.max_courant >= 1) | (health.escaped > 0)
-    return {name: jnp.where(broken, jnp.nan, score) for name, score in objective(outcome).items()}
+    return {name: jnp.where(broken, jnp.nan, score) for name, score in _scores(objective, outcome).items()}
+
+
+def _scores(objective: Objective, outcome: Outcome) -> Scores:
+    """Scores of an objective; what its own code raises is told with file and line."""
+    function = objective.func if isinstance(objective, partial) else objective
+    file = getattr(getattr(function, "__code__", None), "co_filename", "")
+    if function in OBJECTIVES.values():
+        return objective(outcome)
+    with _running(Path(file)):
+        scores = objective(outcome)
+    if not isinstance(scores, dict) or not scores or not all(np.ndim(score) == 0 for score in scores.values()):
+        raise InputError(
+            f"{file}: {getattr(function, '__name__', 'the objective')} must return a dictionary of numbers by name, one"
+            " of them 'loss' for tuning."
+        )
+    return scores
 
 
 def _share(outcome: Outcome, rows: tuple[int, ...]) -> Float[Array, "p"]:
@@ -152,19 +195,60 @@ def _from_file(path: Path, name: str) -> Callable[..., Scores]:
     if not path.is_file():
         raise MissingFileError(f"{path}: file of objective.function does not exist; check the path.")
     spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None
-    assert spec.loader is not None
+    if spec is None or spec.loader is None:
+        raise InputError(f"{path}: objective.function needs a Python file, *.py.")
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    if not callable(getattr(module, name, None)):
-        raise SceneError(f"objective.function: {path} defines no function {name!r}.")
-    return getattr(module, name)
+    with _running(path):
+        spec.loader.exec_module(module)
+    found = getattr(module, name, None)
+    if not callable(found):
+        own = [key for key, value in vars(module).items() if inspect.isfunction(value)]
+        raise SceneError(f"objective.function: {path} defines no function {name!r}; {suggest(name, own)}.")
+    return found
 
 
-def _read_target(folder: Path, target: Any) -> Float[Array, "t h w 3"]:
+@contextmanager
+def _running(path: Path) -> Iterator[None]:
+    """Turn what the code of a study raises into one sentence with its file and line.
+
+    Raises:
+        InputError: the block raised any exception but an InputError.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except SyntaxError as error:
+        raise InputError(f"{error.filename or path}, line {error.lineno}: {error.msg}; mend the objective.") from error
+    except (Exception, SystemExit) as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        line = next((frame.lineno for frame in reversed(frames) if Path(frame.filename) == path), None)
+        where = f"{path}, line {line}" if line is not None else f"{path}"
+        said = " ".join(str(error).split())[:200]
+        raise InputError(f"{where}: {type(error).__name__}: {said}; mend the objective.") from error
+
+
+def _check_options(found: Callable[..., Scores], options: dict[str, Any], function: str) -> None:
+    """Whether a function of a file takes these options, and is given all that it needs."""
+    try:
+        parameters = list(inspect.signature(found).parameters.values())[1:]
+    except (TypeError, ValueError):  # what has no signature, as some builtins
+        return
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+        return
+    known = {p.name: p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
+    for name in options:
+        if name not in known:
+            raise SceneError(
+                f"{joined('objective.options', name)}: {function} has no such option; {suggest(name, known)}."
+            )
+    for name, parameter in known.items():
+        if parameter.default is parameter.empty and name not in options:
+            raise SceneError(f"{joined('objective.options', name)} is missing: {function} needs it.")
+
+
+def _read_target(folder: Path, target: str) -> Float[Array, "t h w 3"]:
     """Frames of a folder of pictures, of a video, or of an `.npy` file."""
-    if not isinstance(target, str):
-        raise SceneError("objective.options.target is missing: name a folder of .png frames, a video, or an .npy file.")
     path = folder / target
     if path.is_dir():
         pictures = [io.read_image(picture) for picture in sorted(path.glob("*.png"))]
@@ -173,4 +257,9 @@ def _read_target(folder: Path, target: Any) -> Float[Array, "t h w 3"]:
         return jnp.asarray(np.stack(pictures))
     if not path.is_file():
         raise MissingFileError(f"{path}: objective.options.target does not exist; check the path.")
-    return jnp.asarray(io.load_array(path, "array of frames") if path.suffix == ".npy" else io.read_video(path))
+    if path.suffix != ".npy":
+        return jnp.asarray(io.read_video(path))
+    frames = np.asarray(io.load_array(path, "array of video frames"))
+    if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype.kind not in "fiu" or not np.isfinite(frames).all():
+        raise InputError(f"{path}: an array of shape {frames.shape}; finite frames of shape [t, h, w, 3] are needed.")
+    return jnp.asarray(frames, jnp.float32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,8 +16,8 @@ import numpy as np
 from pigjax import io
 from pigjax.errors import SceneError
 from pigjax.study.experiment import Experiment, Outcome, experiment
-from pigjax.study.objectives import Objective, Scores, objective_of
-from pigjax.study.schema import Study, Value
+from pigjax.study.objectives import Objective, Scores, check_aim, objective_of
+from pigjax.study.schema import MOST_ROWS, Study, Value
 from pigjax.study.voting import Voting, voting
 from pigjax.tune import Bounds, History, Table, fit, search, sweep
 
@@ -109,15 +110,20 @@ def _trial(study: Study, rows: Sequence[Row], *, soft: bool) -> tuple[Callable[.
         temperature = study.objective.options.get("temperature", _SOFT_VOTES if soft else None)
         if study.objective.function != "votes":
             raise SceneError("objective.function: thresholds of the vote are scored by 'votes'.")
+        study.objective.check()
         return _score_votes, (voting(scene, temperature=temperature),)
     if any(of_votes):
         raise SceneError("parameters: thresholds of the vote decide what is simulated: study them apart from the rest.")
+    options = study.objective.options
+    if study.objective.function == "aim":
+        moving = [name for name, spec in scene.objects.items() if not spec.fixed]
+        check_aim(options["object"], options.get("frame", -1), moving, scene.simulation.frames)
+    objective = objective_of(study.objective.function, options, Path(study.folder))
     start = {name: own.start for name, own in study.parameters.items() if own.start is not None}
     extremes = [*_ends(study, rows), *([start] if start else [])]
     made = experiment(scene, extremes=extremes, regions=study.regions, alone=study.only is not None)
     for name in study.parameters:
         made.value(name)  # unknown names are told before anything is compiled
-    objective = objective_of(study.objective.function, study.objective.options, Path(study.folder))
     only_drawn = all(name.startswith("clamp.") for name in study.parameters)
     outcome = jax.jit(Experiment.simulate)(made) if only_drawn else None
     return partial(_score, objective), (made, outcome)
@@ -140,6 +146,10 @@ def _rows(study: Study) -> list[Row]:
         if len(set(lengths.values())) > 1:
             raise SceneError(f"parameters: rows are joined one by one, but there are {lengths} values.")
         return [dict(zip(columns, row)) for row in zip(*columns.values())]
+    count = math.prod(len(values) for values in columns.values())
+    if count > MOST_ROWS:
+        sizes = ", ".join(f"{len(values)} of {name}" for name, values in columns.items())
+        raise SceneError(f"parameters: {count} rows ({sizes}) are more than {MOST_ROWS}; lower their count.")
     return [dict(zip(columns, row)) for row in itertools.product(*columns.values())]
 
 
@@ -169,6 +179,12 @@ def _bounds(name: str, study: Study) -> Bounds | None:
 def _start(name: str, study: Study, made: Experiment | Voting) -> jax.Array:
     own: Value | None = study.parameters[name].start
     present = made.value(name)
+    spec = study.parameters[name]
+    for field, value in (("low", spec.low), ("high", spec.high), ("start", own)):
+        if value is not None and np.ndim(value) and np.shape(value) != present.shape:
+            raise SceneError(
+                f"parameters.{name}.{field} = {np.asarray(value).tolist()}: give one number, or {present.size} of them."
+            )
     return present if own is None else jnp.broadcast_to(jnp.asarray(own, present.dtype), present.shape)
 
 

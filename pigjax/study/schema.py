@@ -5,87 +5,173 @@ from __future__ import annotations
 import contextlib
 import copy
 import os
-import tomllib
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-import msgspec
 import numpy as np
-from msgspec import Struct
+from msgspec import field
 
-from pigjax.errors import MissingFileError, SceneError
-from pigjax.scene.schema import Scene, explain, scene_from
+from pigjax.checks import LARGEST_WHOLE, Limits, joined, suggest
+from pigjax.errors import SceneError
+from pigjax.scene.decode import Section, decode
+from pigjax.scene.schema import Scene, read_file, scene_from
 
 Value = float | tuple[float, ...]
+MOST_ROWS = 1_000_000  # of a sweep
 
 
-class ParameterSpec(Struct, forbid_unknown_fields=True, frozen=True):
+class ParameterSpec(Section, frozen=True):
     """One parameter: the values of a sweep, or the bounds and the start of a search."""
 
     values: list[Value] | None = None  # of a sweep; None: `count` of them from low to high
     low: Value | None = None  # bounds of a search, or ends of a sweep; one for all components, or one each
     high: Value | None = None
-    count: int = 5
+    count: Annotated[int, Limits(1, MOST_ROWS)] = 5
     scale: Literal["linear", "log"] = "linear"
     start: Value | None = None  # of a search; None: the scene's own value
+
+    def rules(self) -> Iterable[tuple[str, bool, str]]:
+        """Ends are in order, have logarithms where those are asked for, and a start lies between them."""
+        given = (*(self.values or ()), self.start, self.low, self.high)
+        lengths = {len(value) for value in given if isinstance(value, tuple)}
+        if self.values is not None:
+            yield "values", len(self.values) > 0, "give one value or more"
+            alike = {np.shape(value) for value in self.values}
+            yield "values", len(alike) < 2, "all values must have as many numbers as the first"
+        for name in ("low", "high", "start"):
+            own = getattr(self, name)
+            fits = not isinstance(own, tuple) or (lengths == {len(own)} and len(own) > 0)
+            yield name, fits, "give one number, or as many as the other values of the parameter have"
+            positive = own is None or bool(np.all(np.greater(own, 0)))
+            yield name, self.scale == "linear" or positive, "must be > 0 on a logarithmic scale"
+        if self.low is not None and self.high is not None:
+            yield "low", bool(np.all(np.less(self.low, self.high))), f"it must be below high = {self.high}"
+        if self.start is not None:
+            above = self.low is None or bool(np.all(np.greater(self.start, self.low)))
+            below = self.high is None or bool(np.all(np.less(self.start, self.high)))
+            ends = f"low = {self.low} and high = {self.high}"
+            yield "start", above and below, f"a search must start between {ends}, not on them or outside"
 
     def swept(self, name: str) -> list[Value]:
         """Values of a sweep.
 
         Raises:
-            SceneError: neither values nor two ends, or ends that have no logarithm.
+            SceneError: neither values nor two ends.
         """
         if self.values is not None:
             return self.values
         if not (isinstance(self.low, float) and isinstance(self.high, float)):
-            raise SceneError(f"parameters.{name}: give values, or low and high (and count) for a sweep.")
-        if self.scale == "log" and not min(self.low, self.high) > 0:
-            raise SceneError(f"parameters.{name}.low = {self.low}: the ends of a logarithmic scale must be > 0.")
+            raise SceneError(f"{joined('parameters', name)}: give values, or low and high (and count) for a sweep.")
         space = np.geomspace if self.scale == "log" else np.linspace
         return [float(value) for value in space(self.low, self.high, self.count)]
 
 
-class SweepSpec(Struct, forbid_unknown_fields=True, frozen=True):
+class SweepSpec(Section, frozen=True):
     """How the parameters' values are joined, and what of the results is shown."""
 
     join: Literal["grid", "rows"] = "grid"  # all combinations, or the k-th value of each together
-    batch: int | None = None  # rows at once; None: what memory holds
+    batch: Annotated[int, Limits(1, MOST_ROWS)] | None = None  # rows at once; None: what memory holds
     best: Literal["min", "max"] = "min"
     of: str = "loss"  # the result that is judged and drawn
 
 
-class TuneSpec(Struct, forbid_unknown_fields=True, frozen=True):
+class TuneSpec(Section, frozen=True):
     """The search for the least loss."""
 
     method: Literal["adam", "cma"] = "adam"  # by gradients, or without
-    rate: float = 0.05  # of Adam, in the unit of the bounds' transform
-    steps: int = 100  # of Adam, or losses evaluated without gradients
-    clip: float | None = None  # largest norm of a gradient
-    patience: int | None = None  # steps without a better loss before it stops
-    restarts: int = 0
-    seed: int = 0
+    rate: Annotated[float, Limits(0, 1e3, above=True)] = 0.05  # of Adam, in the unit of the bounds' transform
+    steps: Annotated[int, Limits(1, 10_000_000)] = 100  # of Adam, or losses evaluated without gradients
+    clip: Annotated[float, Limits(0, above=True)] | None = None  # largest norm of a gradient
+    patience: Annotated[int, Limits(1, LARGEST_WHOLE)] | None = None  # steps without a better loss before it stops
+    restarts: Annotated[int, Limits(0, 10_000)] = 0
+    seed: Annotated[int, Limits(0, LARGEST_WHOLE)] = 0
 
 
-class ObjectiveSpec(Struct, forbid_unknown_fields=True, frozen=True):
+class MotionOptions(Section, frozen=True):
+    """Options of the objective `motion`: none."""
+
+
+class AimOptions(Section, frozen=True):
+    """Options of the objective `aim`."""
+
+    object: str  # a moving object of the scene
+    # where its middle is to be; axes that are NaN do not count
+    target: Annotated[tuple[float, float, float], Limits(-1e9, 1e9, unit="m", nan=True)]
+    frame: Annotated[int, Limits(-100_000, 99_999)] = -1  # after which it is looked at, from 0; -1: the last
+
+
+class ShapeOptions(Section, frozen=True):
+    """Options of the objective `shape`."""
+
+    aspect: Annotated[float, Limits(0, above=True)] = 10.0
+    stretch: Annotated[float, Limits(0, above=True)] = 3.0
+
+
+class VideoOptions(Section, frozen=True):
+    """Options of the objective `video`."""
+
+    target: str  # folder of .png frames, a video, or an .npy file, relative to the study file
+    levels: Annotated[int, Limits(1, 32)] = 1  # sizes at which the pictures are compared
+
+
+class VotesOptions(Section, frozen=True):
+    """Options of the objective `votes`."""
+
+    temperature: Annotated[float, Limits(0, 1e3, above=True)] | None = None  # of soft votes; None: see `tune_study`
+
+
+OPTIONS: dict[str, type[Section]] = {
+    "motion": MotionOptions,
+    "aim": AimOptions,
+    "shape": ShapeOptions,
+    "video": VideoOptions,
+    "votes": VotesOptions,
+}
+
+
+class ObjectiveSpec(Section, frozen=True):
     """What is scored: one of `study.OBJECTIVES`, or `file.py:function` beside the study file."""
 
     function: str
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def check(self) -> None:
+        """Whether there is such an objective, and what it is told is right as far as it is known. Host.
+
+        Raises:
+            SceneError: there is no such objective, or an option is unknown, is missing, or has a wrong value.
+        """
+        if not self.is_code() and self.function not in OPTIONS:
+            names = (*OPTIONS, "file.py:function")
+            raise SceneError(f"objective.function = {self.function!r}: {suggest(self.function, names)}.")
+        if not self.is_code():
+            decode(self.options, OPTIONS[self.function], "objective.options")
+
+    def is_code(self) -> bool:
+        """Whether it is a function of a Python file, which a study runs."""
+        return ".py:" in self.function
 
 
-class Study(Struct, forbid_unknown_fields=True, frozen=True):
+class Study(Section, frozen=True):
     """A whole study file."""
 
     scene: str  # scene file, relative to the study file
     objective: ObjectiveSpec
     parameters: dict[str, ParameterSpec]
-    overrides: dict[str, Any] = {}  # fields of the scene that differ here: "simulation.frames" = 8
+    # fields of the scene that differ here: "simulation.frames" = 8
+    overrides: dict[str, Any] = field(default_factory=dict)
     only: list[str] | None = None  # objects that are simulated and drawn; None: all of the scene
-    regions: dict[str, int] = {}  # parts of an object with numbers of their own
+    # parts of an object with numbers of their own
+    regions: dict[str, Annotated[int, Limits(1, 10_000)]] = field(default_factory=dict)
     sweep: SweepSpec = SweepSpec()
     tune: TuneSpec = TuneSpec()
     folder: str = "."  # set by `load_study`; what relative paths start from
+
+    def rules(self) -> Iterable[tuple[str, bool, str]]:
+        """Something varies."""
+        yield "parameters", bool(self.parameters), "a study varies one or more"
 
     def to_scene(self) -> Scene:
         """The scene with what is different in this study.
@@ -117,10 +203,10 @@ class Study(Struct, forbid_unknown_fields=True, frozen=True):
 
     def _values(self) -> dict[str, Any]:
         path = Path(self.folder) / self.scene
-        values = _read_toml(path, "scene file")
+        values = read_file(path, "scene file")
         for name, value in self.overrides.items():
             _put(values, name, value)
-        if self.only is not None:
+        if self.only is not None and isinstance(values.get("objects", {}), dict):
             missing = [name for name in self.only if name not in values.get("objects", {})]
             if missing:
                 raise SceneError(f"only: {missing[0]}: {path} has no such object.")
@@ -130,45 +216,41 @@ class Study(Struct, forbid_unknown_fields=True, frozen=True):
 
 def _put(values: dict[str, Any], name: str, value: Any) -> None:
     """Set a field by its dotted name."""
-    *sections, field = name.split(".")
+    *sections, last = name.split(".")
     for section in sections:
         values = values.setdefault(section, {})
         if not isinstance(values, dict):
-            raise SceneError(f"{name}: {section} is no section of the scene file.")
-    values[field] = value
+            raise SceneError(f"overrides: {name}: {section} is no section of the scene file.")
+    values[last] = value
 
 
 def load_study(path: str | Path, *, method: str | None = None) -> Study:
     """Read and check a study file; `method`, if given, is that of `tune`. Host.
 
+    A study whose objective is a function of a Python file runs that file: where it lies outside the working folder, a
+    warning says so.
+
     Raises:
         MissingFileError: there is no such file.
-        SceneError: it is not TOML, a field is unknown (the nearest right name is told) or has the wrong type.
+        SceneError: it is not TOML, a field or option is unknown (the nearest right name is told), has the wrong type,
+            or a value is out of range.
     """
     path = Path(path)
-    values = _read_toml(path, "study file")
+    values = read_file(path, "study file")
     if method is not None:
-        values["tune"] = values.get("tune", {}) | {"method": method}
+        tune = values.get("tune", {})
+        values["tune"] = tune | {"method": method} if isinstance(tune, dict) else tune
     try:
-        study = msgspec.convert({**values, "folder": str(path.parent)}, Study)
-    except msgspec.ValidationError as error:
-        raise SceneError(f"{path}: {explain(str(error), values, _fields_at)}") from None
-    if not study.parameters:
-        raise SceneError(f"{path}: parameters: a study varies one or more.")
+        study = decode(values, Study, folder=str(path.parent))
+        study.objective.check()
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from error.__cause__
+    if study.objective.is_code():
+        code = (path.parent / study.objective.function.rpartition(":")[0]).resolve()
+        if not code.is_relative_to(Path.cwd()):
+            warnings.warn(
+                f"{path}: objective.function runs the Python code of {code}, outside the working folder; go on only if"
+                " you trust it.",
+                stacklevel=2,
+            )
     return study
-
-
-def _read_toml(path: Path, what: str) -> dict[str, Any]:
-    if not path.is_file():
-        raise MissingFileError(f"{path}: {what} does not exist; check the path.")
-    try:
-        return tomllib.loads(path.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SceneError(f"{path}: not valid TOML: {error}.") from None
-
-
-def _fields_at(place: str) -> Sequence[str]:
-    structs: dict[str, type[Struct]] = {"parameters": ParameterSpec, "objective": ObjectiveSpec}
-    structs |= {"sweep": SweepSpec, "tune": TuneSpec}
-    fields = structs.get(place.split(".")[0], Study).__struct_fields__
-    return tuple(name for name in fields if name != "folder")

@@ -14,9 +14,10 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from pigjax.camera import Camera
+from pigjax.checks import suggest
 from pigjax.errors import SceneError
-from pigjax.scene.plan import read_inputs
-from pigjax.scene.schema import Scene, suggest
+from pigjax.scene.plan import check_ids_occur, read_inputs
+from pigjax.scene.schema import Scene
 from pigjax.segmentation import enough_capacity, lift_masks
 from pigjax.splat import Gaussians, RenderConfig, render
 
@@ -115,6 +116,7 @@ def voting(scene: Scene, *, temperature: float | None = None) -> Voting:
     if inputs.views is None or inputs.views.masks is None:
         raise SceneError("input.views is missing: a study of segmentation needs posed photos with masks.")
     views, masks = inputs.views, inputs.views.masks
+    check_ids_occur(inputs.ids, masks)
     if {"train", "test"} <= set(views.splits):
         train, held = views.subset("train"), views.subset("test")
         shown, hidden = (train.cameras, train.masks), (held.cameras, held.masks)

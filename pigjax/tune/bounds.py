@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from pigjax.checks import ANY, shown
 from pigjax.errors import InputError
 
 End = float | tuple[float, ...] | None
@@ -35,11 +36,21 @@ class Bounds:
     def __post_init__(self):
         if self.scale not in ("linear", "log"):
             raise InputError(f"Bounds.scale = {self.scale!r}: choose linear or log.")
-        if self.low is not None and self.high is not None and not np.all(np.less(self.low, self.high)):
-            raise InputError(f"Bounds: low = {self.low} is not below high = {self.high}; exchange them.")
+        for name, end in (("low", self.low), ("high", self.high)):
+            if end is not None and not _is_numbers(end):
+                raise InputError(f"Bounds.{name} = {shown(end)}: must be a number, one for each component, or None.")
+        if self.low is not None and self.high is not None and len({np.shape(self.low), np.shape(self.high), ()}) > 2:
+            raise InputError(
+                f"Bounds: low = {self.low} and high = {self.high} must have as many numbers as each other."
+            )
         for name, end in (("low", self.low), ("high", self.high)):
             if end is not None and not np.isfinite(end).all():
                 raise InputError(f"Bounds.{name} = {end}: must be finite, or None for no bound.")
+            if end is not None and ANY.broken(end) is not None:
+                raise InputError(f"Bounds.{name} = {shown(end)}: {ANY.broken(end)}.")
+        if self.low is not None and self.high is not None and not np.all(np.less(self.low, self.high)):
+            raise InputError(f"Bounds: low = {self.low} is not below high = {self.high}; exchange them.")
+        for name, end in (("low", self.low), ("high", self.high)):
             if end is not None and self.scale == "log" and not np.all(np.greater(end, 0)):
                 raise InputError(f"Bounds.{name} = {end}: must be > 0 on a logarithmic scale.")
 
@@ -49,12 +60,15 @@ class Bounds:
         Raises:
             InputError: it lies on a bound or beyond, or is not > 0 on a logarithmic scale.
         """
-        number = np.asarray(value, float)
-        shown = number.tolist()
+        try:
+            number = np.asarray(value, float)
+        except (TypeError, ValueError):
+            raise InputError(f"{name} = {shown(value)}: a search must start at numbers.") from None
+        said = number.tolist()
         if not np.isfinite(number).all():
-            raise InputError(f"{name} = {shown}: a search must start at finite numbers.")
+            raise InputError(f"{name} = {said}: a search must start at finite numbers.")
         if self.scale == "log" and not (number > 0).all():
-            raise InputError(f"{name} = {shown}: must be > 0 on a logarithmic scale.")
+            raise InputError(f"{name} = {said}: must be > 0 on a logarithmic scale.")
         low, high = self._ends(float)
         at = np.log(number) if self.scale == "log" else number
         room = _EDGE * (1.0 if low is None or high is None else np.asarray(high - low))
@@ -63,7 +77,7 @@ class Bounds:
         # a range may be narrower than its precision can tell
         if below or above or not np.isfinite(self.to_free(jnp.asarray(value))).all():
             raise InputError(
-                f"{name} = {shown}: a search must start between its bounds {self.low} and {self.high}, not on them or"
+                f"{name} = {said}: a search must start between its bounds {self.low} and {self.high}, not on them or"
                 " outside."
             )
 
@@ -102,6 +116,14 @@ class Bounds:
         return [
             None if end is None else np.asarray(log(np.asarray(end, float)), dtype) for end in (self.low, self.high)
         ]
+
+
+def _is_numbers(end: Any) -> bool:
+    try:
+        array = np.asarray(end)
+    except ValueError:  # a list of lists that differ in length
+        return False
+    return array.size > 0 and np.issubdtype(array.dtype, np.number)
 
 
 def _inverse_softplus(value):

@@ -1,0 +1,153 @@
+"""Structs from plain values, as TOML gives them: every error tells the field's full name, its value and the remedy."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+
+import msgspec
+from msgspec import Struct
+from msgspec.structs import fields
+
+from pigjax.checks import ANY, LARGEST_WHOLE, Limits, joined, location, shown, suggest
+from pigjax.errors import SceneError
+
+_WHOLE = Limits(0, LARGEST_WHOLE)
+
+
+class Section(Struct, forbid_unknown_fields=True, frozen=True):
+    """A table of a file. Its fields' annotations hold types, choices and `Limits`."""
+
+    def rules(self) -> Iterable[tuple[str, bool, str]]:
+        """What must hold between fields: the field to name, whether it holds, and the rule in words."""
+        return ()
+
+
+S = TypeVar("S", bound=Section)
+
+
+def decode(values: Any, kind: type[S], name: str = "", **given: Any) -> S:
+    """A struct from the values of a table, checked.
+
+    Args:
+        values: the table.
+        kind: the struct.
+        name: dotted name of the table; empty for the whole file.
+        given: fields that the caller sets, and the table must not have.
+
+    Raises:
+        SceneError: a field is unknown (the nearest right name is told), is missing, has the wrong type, or a number is
+            not finite or out of range.
+    """
+    if not isinstance(values, Mapping):
+        raise SceneError(f"{name or 'top level'} = {shown(values)}: it must be a table.")
+    known = {field.name: field for field in fields(kind) if field.name not in given}
+    for key in values:
+        if key not in known:
+            raise SceneError(f"{joined(name, str(key))}: unknown field; {suggest(key, known)}.")
+    for field in known.values():
+        if field.required and field.name not in values:
+            raise SceneError(f"{joined(name, field.name)} is missing: give {wanted(field.type)}{_range(field.type)}.")
+    made = kind(**{key: _value(value, known[key].type, joined(name, key)) for key, value in values.items()}, **given)
+    for broken, holds, rule in made.rules():
+        if not holds:
+            value = getattr(made, broken, None)
+            said = f" = {shown(value)}" if isinstance(value, int | float | str | tuple) else ""
+            raise SceneError(f"{joined(name, broken)}{said}: {rule}.")
+    return made
+
+
+def numbers_of(kind: type[Struct]) -> Iterator[tuple[str, Any, Limits]]:
+    """Fields of a struct that hold numbers: name, type, range."""
+    for field in fields(kind):
+        if _holds_numbers(field.type):
+            yield field.name, field.type, limits_of(field.type)
+
+
+def limits_of(kind: Any) -> Limits:
+    """Range of the numbers of a type, as annotated; else any finite number, or any whole number from 0."""
+    for part in _parts(kind):
+        if isinstance(part, Limits):
+            return part
+    return _WHOLE if int in _parts(kind) else ANY
+
+
+def wanted(kind: Any) -> str:
+    """What a field of a type takes, in words."""
+    kind = _bare(kind)
+    origin, args = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        return " or ".join(dict.fromkeys(wanted(arg) for arg in args if arg is not type(None)))
+    if origin is Literal:
+        return f"one of {', '.join(map(str, args))}"
+    if origin is tuple and args[-1] is not Ellipsis:
+        return f"{len(args)} numbers"
+    if origin in (tuple, list):
+        inner = wanted(args[0])
+        return "a list of numbers" if inner == "a number" else f"a list (each {inner})"
+    return _WORDS.get(kind, "a table")
+
+
+_WORDS: dict[Any, str] = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+
+
+def _range(kind: Any) -> str:
+    limits = limits_of(kind)
+    return f" {limits}" if _holds_numbers(kind) and not str(limits).startswith("a finite") else ""
+
+
+def _value(value: Any, kind: Any, name: str) -> Any:
+    bare = _bare(kind)
+    if isinstance(bare, type) and issubclass(bare, Section):
+        return decode(value, bare, name)
+    if get_origin(bare) is dict and get_args(bare)[1] is not Any:
+        if not isinstance(value, Mapping):
+            raise SceneError(f"{name} = {shown(value)}: it must be a table.")
+        return {str(key): _value(own, get_args(bare)[1], joined(name, str(key))) for key, own in value.items()}
+    choices = [part for part in _parts(bare) if isinstance(part, str)]
+    if choices and (not isinstance(value, str) or value not in choices):
+        raise SceneError(f"{name} = {shown(value)}: {suggest(value, choices)}.")
+    try:
+        made = msgspec.convert(value, bare)
+    except (msgspec.ValidationError, ValueError, OverflowError, RecursionError) as error:
+        at = location(str(error))
+        if "out of range" in str(error):
+            raise SceneError(f"{name}{at} = {shown(value)}: it {limits_of(kind).broken(float('inf'))}.") from None
+        raise SceneError(f"{name}{at} = {shown(_item(value, at))}: it must be {wanted(kind)}.") from None
+    _check(made, limits_of(kind), name)
+    return made
+
+
+def _check(made: Any, limits: Limits, name: str) -> None:
+    if isinstance(made, list | tuple):
+        for k, item in enumerate(made):
+            _check(item, limits, f"{name}[{k}]")
+    elif isinstance(made, int | float) and not isinstance(made, bool):
+        try:
+            rule = limits.broken(made)
+        except OverflowError:
+            rule = limits.broken(float("inf"))
+        if rule is not None:
+            raise SceneError(f"{name} = {shown(made)}: it {rule}.")
+
+
+def _item(value: Any, at: str) -> Any:
+    """The part of a value at a place such as "[1][0]"."""
+    for index in at.strip("[]").split("][") if at else ():
+        value = value[int(index)] if index.isdecimal() else value
+    return value
+
+
+def _bare(kind: Any) -> Any:
+    return _bare(get_args(kind)[0]) if get_origin(kind) is Annotated else kind
+
+
+def _parts(kind: Any) -> list[Any]:
+    """A type and all that it is made of, limits and choices among them."""
+    return [kind, *(part for arg in get_args(kind) for part in _parts(arg))]
+
+
+def _holds_numbers(kind: Any) -> bool:
+    parts = _parts(kind)
+    return (float in parts or int in parts) and dict not in {get_origin(part) for part in parts}

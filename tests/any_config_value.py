@@ -1,0 +1,64 @@
+"""Any value in any field of the settings: prints what is neither legal nor refused by name. Run without type checks."""
+
+import dataclasses
+import math
+
+import jax
+import numpy as np
+
+from pigjax.clamp import ClampParams
+from pigjax.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
+from pigjax.contact import BodyContact
+from pigjax.errors import InputError
+from pigjax.fitting import FitConfig
+from pigjax.materials import Material
+from pigjax.matter import SimConfig
+from pigjax.sleep import Sleep
+from pigjax.splat import RenderConfig
+from pigjax.tune import Bounds
+
+HUGE = (1e30, 2**40, 10**400)
+VALUES = (math.nan, math.inf, -math.inf, -1, 0, *HUGE, 1e-45, "text", [], {}, None, True, (math.nan,) * 3)
+ZERO, ONE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+MADE = [
+    (RenderConfig, {}),
+    (SimConfig, {}),
+    (FitConfig, {}),
+    (ClampParams, {}),
+    (Sleep, {}),
+    (Bounds, {"low": 1.0, "high": 2.0}),
+    (BodyContact, {"bodies": 2}),
+    (Material, {"model": "fixed_corotated", "density": 1.0, "young": 1.0, "poisson": 0.1}),
+    (Plane, {"point": ZERO, "normal": ONE}),
+    (Box, {"lower": ZERO, "upper": ONE}),
+    (Sphere, {"centre": ZERO, "radius": 1.0}),
+    (Capsule, {"start": ZERO, "end": ONE, "radius": 1.0}),
+    (Cylinder, {"start": ZERO, "end": ONE, "radius": 1.0}),
+    (SampledDistance, {"samples": np.zeros((2, 2, 2)), "origin": ZERO, "dx": 1.0}),
+]
+
+
+def fault(made, field, value):
+    """What is wrong with a value that was accepted; None where it is legal."""
+    own = getattr(made, field.name)
+    if dataclasses.is_dataclass(own):
+        return None
+    for leaf in jax.tree.leaves(own):
+        if not isinstance(leaf, str | bool) and not (np.abs(np.asarray(leaf, float)) <= 1e15).all():
+            return f"accepted {own}"
+    wrong = isinstance(value, str | list | dict) and own is value
+    return "accepted type" if wrong or (value is True and "bool" not in str(field.type)) else None
+
+
+for cls, base in MADE:
+    for field in dataclasses.fields(cls):
+        for value in VALUES:
+            where = f"{cls.__name__}.{field.name} = {str(value)[:30] if value not in HUGE else 'huge'}"
+            try:
+                said = fault(cls(**{**base, field.name: value}), field, value)
+            except InputError as error:
+                said = f"not named: {error}" if field.name not in str(error) or "\n" in str(error) else None
+            except Exception as error:
+                said = f"{type(error).__name__} {str(error)[:150]!r}"
+            if said is not None:
+                print(f"{where}: {said}")

@@ -1,0 +1,225 @@
+"""Values are checked where they are written: any field of any schema takes a legal value or tells its full name."""
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import get_args, get_origin
+
+import msgspec
+import numpy as np
+import pytest
+import tomli_w
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_scene import ball
+
+from pigjax import io
+from pigjax.camera import look_at, stack_cameras
+from pigjax.errors import InputError, SceneError
+from pigjax.materials import LIMITS, PRESETS, Parameters
+from pigjax.scene import load_scene, plan, scene_from
+from pigjax.scene.decode import Section, decode, numbers_of
+from pigjax.scene.schema import Scene, SimulationSpec
+from pigjax.study import OBJECTIVES, load_study
+from pigjax.study.objectives import check_aim, objective_of
+from pigjax.study.run import _rows
+from pigjax.study.schema import OPTIONS, Study
+from pigjax.transfers import KERNELS
+
+VALUES = (math.nan, math.inf, -math.inf, -1, 0, 1e30, 2**40, 10**400, 1e-45, "text", [], {}, None, True, [math.nan] * 3)
+ROUND = {"start": [0, 0, 0], "end": [0, 0, 1], "radius": 0.1}
+SCENE = {
+    "input": {"gaussians": "cloud.ply", "views": "transforms.json"},
+    "simulation": {"dx": 0.05},
+    "objects": {"duck": {"id": 1, "material": "jelly"}, "table": {"id": 2, "fixed": True}},
+    "segmentation": {},
+    "clamp": {},
+    "camera": {},
+    "drawing": {},
+    "accuracy": "draft",
+    "planes": {"ground": {"point": [0, 0, 0], "normal": [0, 0, 1]}},
+    "boxes": {"crate": {"lower": [0, 0, 0], "upper": [1, 1, 1]}},
+    "spheres": {"ball": {"centre": [0, 0, 0], "radius": 1.0}},
+    "capsules": {"rod": ROUND},
+    "cylinders": {"disc": ROUND},
+}
+STUDY = {
+    "scene": "scene.toml",
+    "objective": {"function": "aim", "options": {"object": "duck", "target": [0, math.nan, 0]}},
+    "parameters": {"objects.duck.young": {"low": 1e3, "high": 1e5}},
+    "overrides": {"simulation.frames": 8},
+    "regions": {"duck": 2},
+    "sweep": {},
+    "tune": {},
+}
+
+
+def leaves_of(kind, values, path=()):
+    """Path of every field of a struct, and of the structs and tables in it."""
+    for field in msgspec.structs.fields(kind):
+        if field.name == "folder":
+            continue
+        here, own = (*path, field.name), field.type
+        if isinstance(own, type) and issubclass(own, Section):
+            yield from leaves_of(own, values.get(field.name, {}), here)
+        elif get_origin(own) is dict and isinstance(get_args(own)[1], type) and issubclass(get_args(own)[1], Section):
+            for key, entry in values[field.name].items():
+                yield from leaves_of(get_args(own)[1], entry, (*here, key))
+        yield here
+
+
+def with_value(values, path, value):
+    key, *rest = path
+    return {**values, key: with_value(values.get(key, {}), rest, value) if rest else value}
+
+
+SCENE_FIELDS, STUDY_FIELDS = list(leaves_of(Scene, SCENE)), list(leaves_of(Study, STUDY))
+OPTION_FIELDS = [(name, field.name) for name, kind in OPTIONS.items() for field in msgspec.structs.fields(kind)]
+
+
+def assert_in_range(kind, made):
+    """All numbers of a struct are finite and in range."""
+    for field in msgspec.structs.fields(kind):
+        value = getattr(made, field.name)
+        for part in value.values() if isinstance(value, dict) else [value]:
+            if isinstance(part, Section):
+                assert_in_range(type(part), part)
+    for name, _, limits in numbers_of(kind):
+        if (value := getattr(made, name)) is not None and np.size(value):
+            for part in value if isinstance(value, list) else [value]:
+                assert limits.broken(part) is None, (kind, name, value)
+
+
+def assert_one_line(error, path):
+    said = str(error)
+    assert "\n" not in said
+    assert ".".join(path) in said or (".".join(path[:-1]) + "." in said and len(path) > 1) or "objects" in said, said
+    assert len(said) < 700, said
+
+
+def check_scene(path, value):
+    try:
+        scene = scene_from(with_value(SCENE, path, value))
+    except SceneError as error:
+        assert_one_line(error, path)
+    else:
+        assert_in_range(Scene, scene)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from(SCENE_FIELDS), st.sampled_from(VALUES))
+def test_any_value_of_any_scene_field_is_legal_or_one_line_that_names_it(path, value):
+    check_scene(path, value)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.sampled_from(STUDY_FIELDS), st.sampled_from(VALUES))
+def test_any_value_of_any_study_field_is_legal_or_one_line_that_names_it(path, value):
+    try:
+        study = decode(with_value(STUDY, path, value), Study)
+        study.objective.check()
+    except SceneError as error:
+        assert_one_line(error, path)
+    else:
+        assert_in_range(Study, study)
+
+
+def test_any_value_of_any_setting_is_legal_or_refused_by_name():
+    script = Path(__file__).parent / "any_config_value.py"
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr[-2000:]
+
+
+ROWS = {
+    "one id": (
+        "objects",
+        {"a": {"id": 3, "material": "jelly"}, "b": {"id": 3, "fixed": True}},
+        r"objects\.b\.id: 3 is",
+    ),
+    "kernel": (
+        "simulation.kernel",
+        "cubik",
+        r"simulation\.kernel = 'cubik': did you mean 'cubic'\? Choose one of quad",
+    ),
+    "tau": ("clamp.tau_min", 3.0, r"clamp\.tau_min = 3\.0: it must not be above clamp\.tau_max = 2\.0"),
+    "tau_T": ("segmentation.tau_T", 5, r"segmentation\.tau_T = 5\.0: it must be 1 or less"),
+    "friction": ("simulation.contact_friction", -1, r"simulation\.contact_friction = -1\.0: it must be 0 or more"),
+    "velocity": ("objects.duck.velocity", [math.nan, 0, 0], r"objects\.duck\.velocity\[0\] = nan: it must be finite"),
+    "big id": ("objects.duck.id", 2_000_000_000, r"objects\.duck\.id = 2000000000: it must be 65535 or less"),
+    "weight": ("clamp.lambda_R", math.nan, r"clamp\.lambda_R = nan: it must be finite"),
+    "radius": ("camera.radius", 0, r"camera\.radius = 0\.0: it must be > 0 m"),
+}
+
+
+@pytest.mark.parametrize("case", ROWS)
+def test_values_that_would_fail_later_are_refused_at_load(case):
+    name, value, told = ROWS[case]
+    with pytest.raises(SceneError, match=told):
+        scene_from(with_value(SCENE, name.split("."), value))
+
+
+def test_two_objects_whose_names_lead_to_one_id_are_refused(tmp_path):
+    io.save_ply(tmp_path / "cloud.ply", ball(20))
+    (tmp_path / "names.json").write_text('{"1": "duck"}')
+    objects = {"duck": {"material": "jelly"}, "cube": {"id": 1, "material": "sand"}}
+    values = {"input": {"gaussians": "cloud.ply", "names": "names.json"}, "simulation": {"dx": 0.1}, "objects": objects}
+    with pytest.raises(SceneError, match=r"objects\.cube: its id 1 is that of objects\.duck, too"):
+        plan.read_inputs(scene_from(values, folder=tmp_path))
+
+
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_scene_files_are_read_with_and_without_a_byte_order_mark(tmp_path, mark):
+    (tmp_path / "scene.toml").write_text(mark + tomli_w.dumps(SCENE), encoding="utf-8")
+    assert load_scene(tmp_path / "scene.toml").accuracy == "draft"
+
+
+@pytest.mark.parametrize("text", ["x = " + "[" * 2000, "x = " + "1" * 5000])
+def test_deep_and_long_toml_is_one_line(tmp_path, text):
+    (tmp_path / "scene.toml").write_text(text)
+    with pytest.raises(SceneError, match=r"scene\.toml: not a readable TOML file"):
+        load_scene(tmp_path / "scene.toml")
+
+
+def test_indices_beyond_the_end_are_refused_never_clamped():
+    with pytest.raises(SceneError, match=r"objective\.options\.frame = 99: it must be in \[0, 3\]"):
+        check_aim("duck", 99, ("duck",), 4)
+    camera = look_at((0.0, -1.0, 0.0), target=(0.0, 0.0, 0.0), focal=10.0, width=4, height=4)
+    with pytest.raises(IndexError, match="camera 5 of a batch of 1"):
+        stack_cameras([camera])[5]
+
+
+def test_code_of_a_study_is_announced_and_its_errors_name_file_and_line(tmp_path):
+    (tmp_path / "own.py").write_text("x = 1\ny = 1 / 0\n")
+    (tmp_path / "study.toml").write_text(tomli_w.dumps({**STUDY, "objective": {"function": "own.py:loss"}}))
+    with pytest.warns(UserWarning, match=r"runs the Python code of .*own\.py, outside the working folder"):
+        load_study(tmp_path / "study.toml")
+    with pytest.raises(InputError, match=r"own\.py, line 2: ZeroDivisionError"):
+        objective_of("own.py:loss", {}, tmp_path)
+
+
+def test_options_of_objectives_are_told_with_the_nearest_right_one():
+    with pytest.raises(SceneError, match=r"objective\.options\.tarjet: unknown field; did you mean 'target'"):
+        objective_of("aim", {"object": "duck", "tarjet": [0, 0, 0]}, Path())
+    with pytest.raises(SceneError, match=r"objective\.options\.target = \[0, 1\]: it must be 3 numbers"):
+        objective_of("aim", {"object": "duck", "target": [0, 1]}, Path())
+
+
+@pytest.mark.parametrize("count", [0, -5, 2147483648])
+def test_impossible_counts_of_a_sweep_are_refused(count):
+    with pytest.raises(SceneError, match=rf"parameters\.objects\.duck\.young\.count = {count}: it must be"):
+        decode(with_value(STUDY, ("parameters", "objects.duck.young", "count"), count), Study)
+
+
+def test_too_many_rows_of_a_sweep_are_refused():
+    one = {"low": 1.0, "high": 2.0, "count": 2000}
+    with pytest.raises(SceneError, match="4000000 rows"):
+        _rows(decode({**STUDY, "parameters": {"a": one, "b": one}}, Study))
+
+
+def test_tables_of_limits_and_choices_cover_what_there_is():
+    assert set(OPTIONS) == {*OBJECTIVES, "votes"}
+    assert {field.name for field in msgspec.structs.fields(SimulationSpec)} >= {"kernel"}
+    assert set(LIMITS) == {*Parameters.__dataclass_fields__, "bulk"}
+    assert set(KERNELS) == {"quadratic", "cubic"}
+    assert PRESETS
