@@ -1,4 +1,4 @@
-"""Damage to files: to their bytes, to the numbers in their text, and to the structure of JSON, TOML, NumPy and images."""
+"""Damage to files: to bytes, to numbers in text, and to the structure of JSON, TOML, NumPy arrays and images."""
 
 import gzip
 import io

@@ -15,6 +15,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 console = Console(stderr=True)
 _MOST_DEVICES = 8  # an image has too few rows of tiles for more
+DropInvalid = Annotated[
+    bool, typer.Option("--drop-invalid", help="Leave out Gaussians that hold NaN or infinity, with a warning.")
+]
+Origin = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option("--origin", metavar="X Y Z", help="Subtract this point, for georeferenced files [m]."),
+]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")]
 
 

@@ -13,10 +13,10 @@ from pigjax.io.files import (
     write_text,
     writing,
 )
-from pigjax.io.formats import load_gaussians, read_gaussians
+from pigjax.io.formats import load_gaussians, origin_of, read_gaussians
 from pigjax.io.images import contact_sheet, read_image, write_image
 from pigjax.io.masks import load_masks, save_masks
-from pigjax.io.ply import load_ply, load_points, origin_of, read_ply, save_ply
+from pigjax.io.ply import load_ply, load_points, read_ply, save_ply
 from pigjax.io.state import last_state, load_pytree, load_state, save_pytree, save_state
 from pigjax.io.video import read_video, write_video
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from pigjax.errors import InputError
 from pigjax.io.files import PathLike, decoding, existing
-from pigjax.io.origin import Origin
+from pigjax.io.origin import Origin, fits_float32, proper_origin
 from pigjax.io.packed import read_spz
-from pigjax.io.ply import gaussians_of, read_ply, warn_of_dropped
+from pigjax.io.ply import gaussians_of, read_ply, read_positions, warn_of_dropped
 from pigjax.splat import Gaussians
 
 _SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
@@ -54,6 +54,25 @@ def read_gaussians(
     if suffix not in readers:
         raise InputError(f"{path}: unknown kind of file '{suffix}'; give a .ply, .splat or .spz.")
     return gaussians_of(path, readers[suffix](path), drop_invalid=drop_invalid, origin=origin)
+
+
+def origin_of(path: PathLike) -> tuple[float, float, float]:
+    """A round point near the middle of Gaussians or of a point cloud, to give as `origin=`. Host.
+
+    It is 0, 0, 0 where float32 holds the positions well enough as they are.
+
+    Raises:
+        MissingFileError: there is no such file.
+        InputError: the file is damaged.
+    """
+    suffix = existing(path, "file of points or Gaussians").suffix.lower()
+    readers = {".splat": _read_splat, ".spz": read_spz}
+    read = readers.get(suffix)
+    positions = read_positions(path) if read is None else read(path)["means"].astype(np.float64)
+    if fits_float32(positions):
+        return 0.0, 0.0, 0.0
+    x, y, z = proper_origin(positions).tolist()
+    return x, y, z
 
 
 def _read_splat(path: PathLike) -> dict[str, np.ndarray]:

@@ -84,6 +84,17 @@ def shifted(path: PathLike, positions: Float[np.ndarray, "n 3"], origin: Origin 
         return local.astype(np.float32)
 
 
+def fits_float32(positions: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether `shifted` takes the positions without an origin, and without a warning."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            shifted("positions", positions[np.isfinite(positions).all(1)], None)
+    except (InputError, UserWarning):
+        return False
+    return True
+
+
 def unshifted(positions: Float[np.ndarray, "n 3"], origin: Origin | None) -> np.ndarray:
     """Positions plus the origin in float64; without an origin in float32, as they are."""
     if origin is None:

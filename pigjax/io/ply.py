@@ -14,7 +14,7 @@ from jaxtyping import Float
 from pigjax.errors import InputError
 from pigjax.io.colmap import read_points3d
 from pigjax.io.files import PathLike, existing, writing
-from pigjax.io.origin import Origin, proper_origin, shifted, unshifted
+from pigjax.io.origin import Origin, shifted, unshifted
 from pigjax.io.packed import read_packed_ply
 from pigjax.io.ply_table import read_vertices
 from pigjax.splat import Gaussians
@@ -70,8 +70,8 @@ def read_ply(path: PathLike, *, drop_invalid: bool = False, origin: Origin | Non
     return gaussians_of(path, fields, drop_invalid=drop_invalid, origin=origin)
 
 
-def origin_of(path: PathLike) -> tuple[float, float, float]:
-    """A round point near the middle of a cloud or of Gaussians, to give as `origin=`; 0 where none is needed. Host.
+def read_positions(path: PathLike) -> Float[np.ndarray, "n 3"]:
+    """Positions of Gaussians or of a point cloud as the file has them, in float64 [m]. Host.
 
     Raises:
         MissingFileError: there is no such file.
@@ -79,17 +79,11 @@ def origin_of(path: PathLike) -> tuple[float, float, float]:
     """
     path = existing(path, "file of points or Gaussians")
     if path.suffix.lower() in (".bin", ".txt"):
-        positions = read_points3d(path)[0].astype(np.float64)
-    else:
-        positions = np.asarray(_columns(path, read_vertices(path)[0], ["x", "y", "z"], np.float64))
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            shifted(path, positions, None)
-    except (InputError, UserWarning):
-        x, y, z = proper_origin(positions).tolist()
-        return x, y, z
-    return 0.0, 0.0, 0.0
+        return read_points3d(path)[0]
+    vertex, header = read_vertices(path)
+    if "packed_position" in vertex:
+        return read_packed_ply(path, header)["means"].astype(np.float64)
+    return _columns(path, vertex, ["x", "y", "z"], np.float64)
 
 
 def _fields(path: PathLike, vertex: Columns) -> Columns:
