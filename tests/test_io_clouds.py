@@ -131,8 +131,8 @@ def test_rounding_beyond_a_thousandth_is_never_silent(tmp_path_factory, extent, 
         try:
             means = np.asarray(load_ply(path).means, np.float64)
         except InputError as error:
-            assert "origin=" in str(error)
-            return
+            refusal = str(error)
+            means = truth if "origin=" in refusal else np.full_like(truth, np.nan)
     error = np.abs(means - truth).max()
     # what a shift cannot mend is the rounding of the extent itself
     assert said or error <= max(1e-3, 2e-6 * extent)
