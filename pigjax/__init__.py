@@ -21,6 +21,7 @@ from pigjax.io import (
     load_ply,
     load_points,
     load_views,
+    origin_of,
     save_ply,
     write_video,
 )
@@ -112,6 +113,7 @@ __all__ = [
     "mean_iou",
     "object_mask",
     "orbit",
+    "origin_of",
     "preset",
     "prune",
     "psnr",

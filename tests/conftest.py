@@ -42,7 +42,9 @@ def pytest_configure(config):
 def accepted_flags(flags):
     """Those that this XLA knows: it ends the process at any other, so that a child process tries them."""
     tried = {**os.environ, "XLA_FLAGS": " ".join(flags), "JAX_PLATFORMS": "cpu"}
-    done = subprocess.run([sys.executable, "-c", "import jax; jax.devices()"], env=tried, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", "import jax; jax.devices()"], env=tried, capture_output=True, text=True
+    )
     if done.returncode == 0 or not flags:
         return flags
     known = tuple(flag for flag in flags if flag not in done.stderr)

@@ -94,7 +94,7 @@ def test_float64_state_is_saved_and_float32_comes_back(tmp_path, x64):
 
 
 def test_invalid_splats_are_dropped_and_counted(tmp_path):
-    change = {(1, "y"): np.nan, (2, "opacity"): np.inf, **{(3, f"rot_{i}"): 0.0 for i in range(4)}}
+    change = {(1, "y"): np.nan, (2, "opacity"): np.nan, **{(3, f"rot_{i}"): 0.0 for i in range(4)}}
     path = handmade(tmp_path / "a.ply", count=5, change=change)
     gaussians, dropped = read_ply(path, drop_invalid=True)
     assert dropped == 3
@@ -169,7 +169,7 @@ def test_no_vertices_element(tmp_path):
 
 def test_unwritable_place_is_named(tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(InputError, match=r"file/a\.ply: cannot be written"):
+    with pytest.raises(InputError, match=r"file is a file, where a folder is needed"):
         save_ply(tmp_path / "file" / "a.ply", random_gaussians())
 
 

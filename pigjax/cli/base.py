@@ -19,6 +19,13 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 # names come from files: nothing that is printed is taken for markup, a style is given by `said`
 console = Console(stderr=True, markup=False, emoji=False, highlight=False)
 _MOST_DEVICES = 8  # an image has too few rows of tiles for more
+DropInvalid = Annotated[
+    bool, typer.Option("--drop-invalid", help="Leave out Gaussians that hold NaN or infinity, with a warning.")
+]
+Origin = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option("--origin", metavar="X Y Z", help="Subtract this point, for georeferenced files [m]."),
+]
 
 
 def output_path(path: str) -> Path:

@@ -10,7 +10,7 @@ import typer
 from rich.progress import TaskID
 from rich.table import Table
 
-from pigjax.cli.base import Out, app, console, one_device_per_core, progress, row, said
+from pigjax.cli.base import DropInvalid, Origin, Out, app, console, one_device_per_core, progress, row, said
 
 TauT = Annotated[float, typer.Option(help="Transmittance that marks the surface.", min=0, max=1)]
 TauD = Annotated[float, typer.Option(help="Relative depth tolerance of a vote.", min=0, max=1)]
@@ -39,6 +39,7 @@ def reconstruct(
     refine_poses: Annotated[bool, typer.Option(help="Correct training cameras, into OUT/poses.json.")] = False,
     previews: Annotated[int, typer.Option(help="Steps between preview pictures; 0 for none.", min=0)] = 0,
     seed: int = 0,
+    origin: Origin = None,
 ) -> None:
     """Fit Gaussians to photos; writes OUT/gaussians.ply, and goes on from OUT/checkpoint if it was stopped."""
     one_device_per_core()
@@ -51,8 +52,8 @@ def reconstruct(
 
     needs_masks = only is not None or random_background
     doublings = max(math.ceil(math.log2(splats / start_splats)), 1) if start_splats else 1
-    loaded = io.load_views(views, masks=needs_masks, max_size=max_size, background=background)
-    points = io.load_points(loaded.points_path) if loaded.points_path else None
+    loaded = io.load_views(views, masks=needs_masks, max_size=max_size, background=background, origin=origin)
+    points = io.load_points(loaded.points_path, origin=origin) if loaded.points_path else None
     config = FitConfig(
         steps=steps,
         splats=splats,
@@ -79,7 +80,7 @@ def reconstruct(
             loaded, config, points=points, checkpoint=out / "checkpoint", previews=out / "previews", callback=tell
         )
     ply = out / "gaussians.ply"
-    io.save_ply(ply, result.gaussians)
+    io.save_ply(ply, result.gaussians, origin=origin)
     if refine_poses:
         poses = dict(zip(result.trained_on, result.cameras.world_to_cam.tolist()))
         io.write_json(out / "poses.json", {"world_to_cam": poses})
@@ -113,6 +114,8 @@ def segment(
     min_seen: MinSeen = None,
     fill: Fill = True,
     remove: Annotated[list[str] | None, typer.Option(help="Object to leave out, by name or id; repeat it.")] = None,
+    drop_invalid: DropInvalid = False,
+    origin: Origin = None,
 ) -> None:
     """Lift masks to the Gaussians; writes labels, one .ply per object, and a sheet that shows which id is which.
 
@@ -121,11 +124,11 @@ def segment(
     from pigjax import io
     from pigjax.scene.objects import segment_files
 
-    cloud = io.load_gaussians(gaussians)
-    loaded = io.load_views(views, masks=masks if masks is not None else True)
+    cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid, origin=origin)
+    loaded = io.load_views(views, masks=masks if masks is not None else True, origin=origin)
     known = {} if names is None else {int(k): str(v) for k, v in io.read_json(names).items()}
     settings = _settings(tau_t, tau_d, weighting, purity, min_seen)
-    counts = segment_files(cloud, loaded, known, out, fill=fill, remove=remove or (), **settings)
+    counts = segment_files(cloud, loaded, known, out, fill=fill, remove=remove or (), origin=origin, **settings)
     table = Table("id", "object", "Gaussians")
     for number, count in counts.items():
         table.add_row(*row(number, known.get(number, "never seen" if number < 0 else ""), count))
@@ -151,12 +154,13 @@ def evaluate(
     fill: Fill = True,
     holes: Annotated[int, typer.Option(help="Close holes of up to this many pixels in the masks.", min=0)] = 0,
     max_size: Annotated[int | None, typer.Option(help="Shrink photos to this many pixels.")] = None,
+    drop_invalid: DropInvalid = False,
 ) -> None:
     """Score objects against true masks (mIoU, mBIoU); writes OUT/scores.json and OUT/sheet.png."""
     from pigjax import io
     from pigjax.scene.evaluate import evaluate_files
 
-    cloud = io.load_gaussians(gaussians)
+    cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid)
     read = io.load_dataset(dataset, layout, masks=masks, vote=labels is None, max_size=max_size, holes=holes)
     with progress() as bar:
         tasks: dict[str, TaskID] = {}

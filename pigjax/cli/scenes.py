@@ -7,10 +7,22 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from msgspec import structs
 from rich.progress import TaskID
 from rich.table import Table
 
-from pigjax.cli.base import Out, app, console, one_device_per_core, output_path, progress, row, said
+from pigjax.cli.base import (
+    DropInvalid,
+    Origin,
+    Out,
+    app,
+    console,
+    one_device_per_core,
+    output_path,
+    progress,
+    row,
+    said,
+)
 from pigjax.errors import InputError
 
 AccuracyOption = Annotated[
@@ -45,16 +57,19 @@ def run(
     scene: Annotated[Path, typer.Argument(help="Scene file (.toml).")],
     out: Out = Path("out"),
     accuracy: AccuracyOption = None,
+    drop_invalid: DropInvalid = False,
 ) -> None:
     """Simulate a scene and draw its video; a killed run goes on from its last frame."""
-    _run(scene, out, accuracy)
+    _run(scene, out, accuracy, drop_invalid=drop_invalid)
 
 
-def _run(path: Path, out: Path, accuracy: str | None) -> None:
+def _run(path: Path, out: Path, accuracy: str | None, *, drop_invalid: bool = False) -> None:
     one_device_per_core()
     from pigjax.scene import load_scene, run_scene
 
     scene = load_scene(path, accuracy=accuracy)
+    if drop_invalid:
+        scene = structs.replace(scene, input=structs.replace(scene.input, drop_invalid=True))
     with progress() as bar:
         tasks: dict[str, TaskID] = {}
 
@@ -90,13 +105,15 @@ def view(
     elevation: Annotated[float, typer.Option(help="Of the camera, in degrees.", min=-89, max=89)] = 25.0,
     up: Annotated[str, typer.Option(help="Axis of the world that points up: x, y, z, -x, -y, -z.")] = "z",
     background: Annotated[float, typer.Option(help="Grey level behind the scene: 0 black, 1 white.")] = 1.0,
+    drop_invalid: DropInvalid = False,
+    origin: Origin = None,
 ) -> None:
     """Draw a file from all around."""
     one_device_per_core()
     from pigjax import io
     from pigjax.scene.turntable import turntable
 
-    cloud = io.load_gaussians(path)
+    cloud = io.load_gaussians(path, drop_invalid=drop_invalid, origin=origin or io.origin_of(path))
     io.output_folder(out.parent, files=(out.name,))
     with progress() as bar:
         task = bar.add_task("view", total=frames)

@@ -24,7 +24,7 @@ from pigjax.io.files import (
     write_toml,
     writing,
 )
-from pigjax.io.formats import load_gaussians
+from pigjax.io.formats import load_gaussians, origin_of, read_gaussians
 from pigjax.io.images import contact_sheet, read_image, write_image
 from pigjax.io.labels import StoredLabels, load_labels, save_labels
 from pigjax.io.masks import load_masks, save_masks
@@ -52,8 +52,10 @@ __all__ = [
     "load_pytree",
     "load_state",
     "load_views",
+    "origin_of",
     "output_folder",
     "plain_label",
+    "read_gaussians",
     "read_image",
     "read_json",
     "read_ply",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from pigjax.io.images import Background, open_rgb
 from pigjax.io.json_cameras import read_inria_cameras, read_transforms
 from pigjax.io.mask_json import frame_order
 from pigjax.io.masks import load_masks
+from pigjax.io.origin import Origin, shifted_pose
 
 
 class Views(eqx.Module):
@@ -75,6 +77,7 @@ def load_views(
     max_size: int | None = None,
     hold_out: int = 8,
     background: Background = 0.0,
+    origin: Origin | None = None,
 ) -> Views:
     """Photos with their cameras, and masks if asked for. Host.
 
@@ -94,13 +97,15 @@ def load_views(
         hold_out: where the file assigns no splits, every n-th view is "test", from the first on, as in 3DGS; 0 or fewer
             views than that: all are "train".
         background: colour behind transparent photos, in 0..1.
+        origin: point subtracted from the cameras' positions in float64 [m], for georeferenced captures: the same that
+            is given to `load_gaussians` and `load_points`. None: nothing is subtracted.
 
     Raises:
         MissingFileError: the file or a photo or mask does not exist.
         InputError: unknown or damaged format, camera model that is no pinhole, pose that is not rigid, photos whose
             size contradicts the camera or differs from view to view, no views in the split, or an unknown name.
     """
-    capture = _read_capture(path, images)
+    capture = _read_capture(path, images, origin)
     splits = _splits(capture, hold_out)
     chosen = range(len(splits)) if split is None else _of_split(splits, split, str(path))
     all_names = _names([shot.image for shot in capture.shots])
@@ -133,26 +138,31 @@ def load_views(
     )
 
 
-def load_cameras(path: PathLike, *, max_size: int | None = None) -> tuple[Camera, tuple[str, ...]]:
+def load_cameras(
+    path: PathLike, *, max_size: int | None = None, origin: Origin | None = None
+) -> tuple[Camera, tuple[str, ...]]:
     """Cameras and names as `load_views` gives them, for drawing where there are no photos. Host.
 
     Raises:
         MissingFileError: the file does not exist.
         InputError: unknown or damaged format, camera model that is no pinhole, or pose that is not rigid.
     """
-    shots = _read_capture(path, None).shots
+    shots = _read_capture(path, None, origin).shots
     sizes = [_target_size(shot, max_size) for shot in shots]
     _check_one_size(shots, sizes)
     return _cameras(shots, sizes), _names([shot.image for shot in shots])
 
 
-def _read_capture(path: PathLike, images: PathLike | None) -> Capture:
+def _read_capture(path: PathLike, images: PathLike | None, origin: Origin | None) -> Capture:
     path = existing(path, "file or folder of views")
     folder = None if images is None else existing_folder(images, "folder of photos")
     capture = _read_json_capture(path, folder) if path.is_file() else _read_folder(path, folder)
     if not capture.shots:
         raise InputError(f"{path}: lists no views; give a file with at least one.")
-    return capture
+    if origin is None:
+        return capture
+    shots = (replace(shot, world_to_cam=shifted_pose(shot.world_to_cam, origin)) for shot in capture.shots)
+    return replace(capture, shots=tuple(shots))
 
 
 def _read_json_capture(path: Path, images: Path | None, split: str | None = None) -> Capture:

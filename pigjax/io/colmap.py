@@ -81,17 +81,21 @@ def read_model(model: Path, *, root: Path, images: Path | None = None) -> Captur
 
 
 def read_points3d(path: Path) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Positions and RGB in 0..1 of `points3D.bin` or `points3D.txt`.
+    """Positions in float64 and RGB in 0..1 of `points3D.bin` or `points3D.txt`.
 
     Raises:
-        InputError: the file is damaged.
+        InputError: the file is damaged, or a colour is not within 0..255.
     """
     try:
-        rows = list(_binary_points(path) if path.suffix == ".bin" else _text_points(path))
-    except (struct.error, ValueError, IndexError) as error:
-        raise _damaged(path, error) from None
-    table = np.asarray(rows, np.float32).reshape(-1, 6)
-    return table[:, :3], table[:, 3:] / 255
+        rows = list(_binary_points(path) if path.suffix.lower() == ".bin" else _text_points(path))
+        table = np.asarray(rows, np.float64).reshape(-1, 6)
+    except Exception as error:  # damage shows itself as almost anything
+        raise InputError(f"{path}: not a complete COLMAP file ({error}); copy or export the model again.") from error
+    wrong = ~((table[:, 3:] >= 0) & (table[:, 3:] <= 255)).all(1)
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise InputError(f"{path}: point {row} has the colour {table[row, 3:].tolist()}; give numbers in 0..255.")
+    return table[:, :3], np.asarray(table[:, 3:] / 255, np.float32)
 
 
 def _damaged(path: Path, error: Exception) -> InputError:
@@ -214,3 +218,5 @@ def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
         _, x, y, z, red, green, blue, _, track = reader.take("Q3d3BdQ")
         reader.skip(8 * track)
         yield x, y, z, red, green, blue
+    if reader.at < len(reader.data):
+        raise ValueError(f"{len(reader.data) - reader.at} bytes follow the last point that its header counts")

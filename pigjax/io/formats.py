@@ -5,39 +5,81 @@ from __future__ import annotations
 import numpy as np
 
 from pigjax.errors import InputError
-from pigjax.io.files import PathLike, existing
-from pigjax.io.ply import gaussians_of, load_ply, read_packed, warn_of_dropped
+from pigjax.io.files import PathLike, decoding, existing
+from pigjax.io.origin import Origin, fits_float32, proper_origin
+from pigjax.io.packed import read_spz
+from pigjax.io.ply import gaussians_of, read_ply, read_positions, warn_of_dropped
 from pigjax.splat import Gaussians
 
 _SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 _SH_CONSTANT = 0.28209479177387814
 
 
-def load_gaussians(path: PathLike, *, drop_invalid: bool = False) -> Gaussians:
+def load_gaussians(path: PathLike, *, drop_invalid: bool = False, origin: Origin | None = None) -> Gaussians:
     """Gaussians from `.ply` (INRIA's layout or PlayCanvas' compressed one), `.splat` or `.spz`. Host.
 
     Compressed `.ply` and `.spz` are decoded by the package gsply: `pip install 'pigjax[formats]'`. These formats and
     `.splat` store rounded numbers, and `.splat` no view-dependent colour. Axes are taken as the file has them: some
     writers of `.spz` turn y and z.
 
+    Args:
+        path: the file.
+        drop_invalid: leave out splats that hold NaN or infinity or whose quaternion is zero; a warning says how many.
+            Off, because such values tell of a failed training.
+        origin: point subtracted from the positions in float64 before they become float32 [m]; see `load_ply`.
+
     Raises:
         MissingFileError: there is no such file.
-        InputError: the file is damaged or of another kind, holds invalid values, or gsply is missing.
+        InputError: the file is damaged or of another kind, holds invalid values or coordinates too far from the
+            origin, or gsply is missing.
     """
-    suffix = existing(path, "file of Gaussians").suffix.lower()
-    if suffix == ".ply":
-        return load_ply(path, drop_invalid=drop_invalid)
-    readers = {".splat": _read_splat, ".spz": read_packed}
-    if suffix not in readers:
-        raise InputError(f"{path}: unknown kind of file '{suffix}'; give a .ply, .splat or .spz.")
-    gaussians, dropped = gaussians_of(path, readers[suffix](path), drop_invalid=drop_invalid)
+    gaussians, dropped = read_gaussians(path, drop_invalid=drop_invalid, origin=origin)
     warn_of_dropped(path, dropped)
     return gaussians
 
 
+def read_gaussians(
+    path: PathLike, *, drop_invalid: bool = False, origin: Origin | None = None
+) -> tuple[Gaussians, int]:
+    """Gaussians as `load_gaussians` gives them, and how many were dropped. Host.
+
+    Raises:
+        MissingFileError: there is no such file.
+        InputError: as `load_gaussians`.
+    """
+    suffix = existing(path, "file of Gaussians").suffix.lower()
+    if suffix == ".ply":
+        return read_ply(path, drop_invalid=drop_invalid, origin=origin)
+    readers = {".splat": _read_splat, ".spz": read_spz}
+    if suffix not in readers:
+        raise InputError(f"{path}: unknown kind of file '{suffix}'; give a .ply, .splat or .spz.")
+    return gaussians_of(path, readers[suffix](path), drop_invalid=drop_invalid, origin=origin)
+
+
+def origin_of(path: PathLike) -> tuple[float, float, float]:
+    """A round point near the middle of Gaussians or of a point cloud, to give as `origin=`. Host.
+
+    It is 0, 0, 0 where float32 holds the positions well enough as they are.
+
+    Raises:
+        MissingFileError: there is no such file.
+        InputError: the file is damaged.
+    """
+    suffix = existing(path, "file of points or Gaussians").suffix.lower()
+    readers = {".splat": _read_splat, ".spz": read_spz}
+    read = readers.get(suffix)
+    positions = read_positions(path) if read is None else read(path)["means"].astype(np.float64)
+    if fits_float32(positions):
+        return 0.0, 0.0, 0.0
+    x, y, z = proper_origin(positions).tolist()
+    return x, y, z
+
+
 def _read_splat(path: PathLike) -> dict[str, np.ndarray]:
     """The 32-byte records of antimatter15's viewer: scales are linear, opacity and quaternion bytes."""
-    raw = existing(path, "file of Gaussians").read_bytes()
+    path = existing(path, "file of Gaussians")
+    with decoding(path, "file of Gaussians"):
+        raw = path.read_bytes()
     if len(raw) % _SPLAT.itemsize:
         raise InputError(
             f"{path}: {len(raw)} bytes are no whole number of 32-byte splats: it is truncated or no .splat file."

@@ -11,12 +11,11 @@ import dataclasses
 import functools
 import hashlib
 import inspect
-import json
 import os
 import sys
 import sysconfig
 import types
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 

@@ -37,6 +37,7 @@ def segment_files(
     *,
     fill: bool,
     remove: Sequence[str] = (),
+    origin: tuple[float, float, float] | None = None,
     **settings: Any,
 ) -> dict[int, int]:
     """Lift masks and write `labels.npz`, `objects/<id>_<name>.ply`, `coloured.ply` and `objects.png`. Host.
@@ -53,6 +54,7 @@ def segment_files(
         out: folder, made if it is missing.
         fill: give unseen Gaussians the id of their neighbours.
         remove: names or ids of objects.
+        origin: what was subtracted from the scene's positions [m]; the files get it back. None: nothing.
         settings: of `lift_masks`.
 
     Returns:
@@ -73,13 +75,15 @@ def segment_files(
     io.save_labels(out / "labels.npz", object_id, labels.votes, labels.confidence)
     counts = {int(number): int(np.sum(object_id == number)) for number in np.unique(object_id)}
     for number in counts:
-        io.save_ply(out / "objects" / f"{_stem(number, names)}.ply", extract_object(gaussians, labels, number))
+        io.save_ply(
+            out / "objects" / f"{_stem(number, names)}.ply", extract_object(gaussians, labels, number), origin=origin
+        )
     colours = id_colours(num_ids)[np.maximum(object_id, 0)] / 255
     flat = jnp.asarray((colours - 0.5) / _SH_CONSTANT, jnp.float32)[:, None]
-    io.save_ply(out / "coloured.ply", eqx.tree_at(lambda g: g.sh, gaussians, flat))
+    io.save_ply(out / "coloured.ply", eqx.tree_at(lambda g: g.sh, gaussians, flat), origin=origin)
     io.write_image(out / "objects.png", _sheet(gaussians, views, object_id, num_ids, names))
     for number in doomed:
-        _remove(gaussians, labels, number, views, out / "removed", _stem(number, names))
+        _remove(gaussians, labels, number, views, out / "removed", _stem(number, names), origin)
     return counts
 
 
@@ -94,10 +98,12 @@ def _id_of(name: str, names: dict[int, str]) -> int:
     raise InputError(f"--remove {name}: {suggest(name, known) if known else 'give its id, or names'}.")
 
 
-def _remove(gaussians: Gaussians, labels: Labels, number: int, views: io.Views, folder: Path, stem: str) -> None:
+def _remove(
+    gaussians: Gaussians, labels: Labels, number: int, views: io.Views, folder: Path, stem: str, origin: Any
+) -> None:
     """The scene without one object, and the hole that it leaves in every view."""
     rest = remove_object(gaussians, labels, number)
-    io.save_ply(folder / f"{stem}.ply", rest)
+    io.save_ply(folder / f"{stem}.ply", rest, origin=origin)
     seen = contributions(gaussians, views.cameras) > _LEAST_SEEN
     holes = [np.asarray(hole_mask(gaussians, labels, number, camera, seen=seen)) for camera in views.cameras]
     io.save_masks(folder / stem, io.safe_names(views.names), 255 * np.stack(holes).astype(np.int32))
@@ -136,10 +142,11 @@ def describe_file(path: Path) -> dict[str, str]:
         InputError: it is damaged, or of no known kind.
     """
     existing(path, "file or folder")
-    if path.suffix.lower() == ".ply":
-        return _describe_gaussians(io.read_ply(path, drop_invalid=True))
-    if path.suffix.lower() in (".splat", ".spz"):
-        return _describe_gaussians((io.load_gaussians(path, drop_invalid=True), 0))
+    if path.suffix.lower() in (".ply", ".splat", ".spz"):
+        origin = io.origin_of(path)
+        described = _describe_gaussians(io.read_gaussians(path, drop_invalid=True, origin=origin))
+        far = {"origin": ", ".join(f"{value:.12g}" for value in origin) + " m, which centres are counted from"}
+        return described | (far if any(origin) else {})
     if path.suffix == ".toml":
         scene = load_scene(path)
         moving = {name: entry.material or entry.model for name, entry in scene.objects.items() if not entry.fixed}

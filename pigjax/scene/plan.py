@@ -67,11 +67,11 @@ def read_inputs(scene: Scene) -> Inputs:
         SceneError: an object has no id.
     """
     spec = scene.input
-    gaussians = io.load_gaussians(scene.path(spec.gaussians))
+    gaussians = io.load_gaussians(scene.path(spec.gaussians), drop_invalid=spec.drop_invalid, origin=spec.origin)
     views = None
     if spec.views is not None:
         masks = True if spec.masks is None else scene.path(spec.masks)
-        views = io.load_views(scene.path(spec.views), masks=masks, max_size=spec.max_size)
+        views = io.load_views(scene.path(spec.views), masks=masks, max_size=spec.max_size, origin=spec.origin)
     known: dict[str, int] = {}
     if spec.names is not None:
         known = {str(name): int(number) for number, name in io.read_json(scene.path(spec.names)).items()}

@@ -37,6 +37,8 @@ class InputSpec(Section, frozen=True):
     masks: str | None = None  # folder of instance masks; None: `object_mask` beside the photos
     names: str | None = None  # JSON of mask ids and names
     max_size: Annotated[int, Limits(1, 65536, unit="px")] | None = None  # of the photos' longer side
+    drop_invalid: bool = False  # leave out Gaussians with NaN or infinity instead of refusing the file
+    origin: Triple | None = None  # subtracted from Gaussians and cameras in float64, for georeferenced files [m]
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"  # axis of the world that points up
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
