@@ -20,7 +20,22 @@ from pigjax.errors import InputError
 
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 _PHOTO_SUFFIXES = frozenset(
-    (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".ppm", ".pgm", ".exr", ".jp2", ".avif", ".heic")
+    (
+        ".png",
+        ".jpg",
+        ".jpeg",
+        ".webp",
+        ".tif",
+        ".tiff",
+        ".bmp",
+        ".gif",
+        ".ppm",
+        ".pgm",
+        ".exr",
+        ".jp2",
+        ".avif",
+        ".heic",
+    )
 )
 _LONGEST = 65535  # [px]
 _FAR_CENTRE = 100  # principal points this many image sides away come from a damaged file
