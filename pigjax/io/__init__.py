@@ -1,7 +1,7 @@
 """Files: the only package that touches them. Everything here runs on the host."""
 
 from pigjax.io.cameras import Views, load_cameras, load_views
-from pigjax.io.datasets import LAYOUTS, Dataset, load_dataset
+from pigjax.io.datasets import LAYOUTS, Dataset, id_named, load_dataset, load_names
 from pigjax.io.files import (
     decoding,
     output_folder,
@@ -26,11 +26,13 @@ __all__ = [
     "Views",
     "contact_sheet",
     "decoding",
+    "id_named",
     "last_state",
     "load_cameras",
     "load_dataset",
     "load_gaussians",
     "load_masks",
+    "load_names",
     "load_ply",
     "load_points",
     "load_pytree",

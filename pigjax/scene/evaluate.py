@@ -117,8 +117,7 @@ def _grounding(
         given = _read_prompts(prompts)
         return {prompt: given.get(prompt) for prompt in wanted}, f"ids given in {prompts.name}"
     if dataset.names and reference is None:
-        named = {name: number for number, name in dataset.names.items()}
-        return {prompt: named.get(prompt) for prompt in wanted}, "ids named in names.json"
+        return {prompt: io.id_named(prompt, dataset.names) for prompt in wanted}, "ids named in names.json"
     view = reference_view(dataset.truths) if reference is None else reference
     if view not in cameras:
         raise InputError(f"reference = {view!r}: no view with truth; choose among {', '.join(cameras)}.")
@@ -130,9 +129,11 @@ def _grounding(
 
 def _read_prompts(path: Path) -> dict[str, int]:
     content = io.read_json(path)
-    sound = isinstance(content, dict) and all(type(number) is int and number > 0 for number in content.values())
+    sound = isinstance(content, dict) and all(type(number) is int and 0 < number < 2**31 for number in content.values())
     if not sound:
-        raise InputError(f'{path}: is not {{prompt: id}} with ids > 0; write for example {{"green apple": 3}}.')
+        raise InputError(
+            f'{path}: is not {{prompt: id}} with ids from 1 to 2³¹ - 1; write for example {{"green apple": 3}}.'
+        )
     return content
 
 

@@ -220,13 +220,14 @@ def _draw_objects(
     inputs: Inputs, labels: Labels, camera: Camera, background: Any, image: np.ndarray, path: Path
 ) -> None:
     """The first frame with its objects tinted, and the legend below."""
-    count = int(np.max(labels.object_id)) + 1
-    membership = jax.nn.one_hot(labels.object_id, count)
+    object_id = np.asarray(labels.object_id)
+    known = np.unique(np.maximum(object_id, 0))
+    membership = jnp.asarray(object_id[:, None] == known, inputs.gaussians.means.dtype)
     frame = render(
         inputs.gaussians, camera, outputs=("object_weights",), object_weights=membership, background=background
     )
     assert frame.object_weights is not None
-    ids = id_image(frame.object_weights)
+    ids = id_image(frame.object_weights, ids=known)
     names = {number: name for name, number in inputs.ids.items()}
     tinted = overlay(image, ids)
     legend = legend_sheet(names, image=image, ids=ids, width=tinted.shape[1])
