@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -229,7 +230,7 @@ def _check_one_size(shots: Sequence[Shot], sizes: Sequence[tuple[int, int]]) -> 
 
 
 def _warn_of_turned(shots: Sequence[Shot]) -> None:
-    turned = [shot.image for shot in shots if shot.image.is_file() and turned_by_exif(shot.image)]
+    turned = [shot.image for shot in shots if os.path.isfile(shot.image) and turned_by_exif(shot.image)]
     if turned:
         warnings.warn(
             f"{turned[0]}: EXIF turns this photo, as {len(turned)} of {len(shots)}; pixels are taken as stored, as"
@@ -239,7 +240,7 @@ def _warn_of_turned(shots: Sequence[Shot]) -> None:
 
 
 def _picture(shot: Shot, size: tuple[int, int], background: Background) -> Float[np.ndarray, "h w 3"]:
-    if not shot.image.is_file():
+    if not os.path.isfile(shot.image):  # Path.is_file raises where a name is too long
         raise MissingFileError(
             f"{shot.image}: no such photo, which {shot.where} names; put it there, or give their folder as images=."
         )

@@ -117,15 +117,15 @@ def load_names(path: PathLike) -> dict[int, str]:
         InputError: the file is no JSON of that form, or an id is written twice.
     """
     content = read_json(path)
-    example = 'write {id: name}, for example {"1": "table"}'
+    example = 'write for example {"1": "table"}'
     if not isinstance(content, dict):
-        raise InputError(f"{path}: is no object of ids and names; {example}.")
+        raise InputError(f"{path}: is not {{id: name}}; {example}.")
     names: dict[int, str] = {}
     for key, name in content.items():
         if not (key.isascii() and key.isdigit() and len(key) <= 18 and int(key) < ID_LIMIT):
             reversed_too = not isinstance(name, bool) and isinstance(name, int)
-            reason = "is {name: id}" if reversed_too else f"{key[:40]!r} is no id from 0 to 2³¹ - 1"
-            raise InputError(f"{path}: {reason}; {example}.")
+            reason = "but {name: id}" if reversed_too else f"since {key[:40]!r} is no id from 0 to 2³¹ - 1"
+            raise InputError(f"{path}: is not {{id: name}}, {reason}; {example}.")
         if not isinstance(name, str) or not name.strip():
             raise InputError(f"{path}: the name of id {key} is {name!r}; {example}.")
         if int(key) in names:

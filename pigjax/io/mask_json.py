@@ -235,7 +235,7 @@ def _views_of(keys: list[str], frames: Sequence[str], path: Path) -> dict[str, s
     for key in keys:
         if key not in whole:
             raise InputError(
-                f"{path}: frame {key!r} is no view: neither a name nor a number from 0 to {len(frames) - 1};"
+                f"{path}: frame {key[:40]!r} is no view: neither a name nor a number from 0 to {len(frames) - 1};"
                 " key the tracks by the number of the photo in sorted order."
             )
     return whole

@@ -132,7 +132,7 @@ def _read_prompts(path: Path) -> dict[str, int]:
     sound = isinstance(content, dict) and all(type(number) is int and 0 < number < 2**31 for number in content.values())
     if not sound:
         raise InputError(
-            f'{path}: is not {{prompt: id}} with ids from 1 to 2³¹ - 1; write for example {{"green apple": 3}}.'
+            f'{path}: is not {{prompt: id}} with ids > 0 and < 2³¹; write for example {{"green apple": 3}}.'
         )
     return content
 
