@@ -1,4 +1,4 @@
-"""Ids of masks and their names: sizes and ids are checked before memory is asked for, votes go by the ids that occur."""
+"""Ids of masks and their names: checked before memory is asked for, and votes go by the ids that occur."""
 
 import json
 import tempfile
@@ -138,7 +138,7 @@ def test_votes_beyond_any_memory_are_refused():
 
 
 def test_scene_in_another_frame_than_the_cameras_is_named():
-    gaussians, cameras, masks = pair()
+    _, cameras, masks = pair()
     for fill in (True, False):
         with pytest.raises(
             InputError, match=r"no camera sees a Gaussian: do the \.ply and the cameras share one frame"
@@ -147,7 +147,10 @@ def test_scene_in_another_frame_than_the_cameras_is_named():
 
 
 def scene_with(tmp_path, number):
-    write(tmp_path / "s.toml", f'[input]\ngaussians = "a.ply"\n[simulation]\ndx = 0.1\n[objects.duck]\nid = {number}\n')
+    write(
+        tmp_path / "s.toml",
+        f'[input]\ngaussians = "a.ply"\n[simulation]\ndx = 0.1\n[objects.duck]\nid = {number}\nmaterial = "jelly"\n',
+    )
     return load_scene(tmp_path / "s.toml")
 
 
