@@ -19,15 +19,37 @@ _GOLDEN = 0.6180339887498949  # steps of hue that keep neighbouring ids far apar
 
 def id_colours(n: int) -> UInt8[np.ndarray, "n 3"]:
     """Colours of the ids 0 to n - 1: grey for the background, then hues at golden steps, host."""
+    return np.array([_colour(number) for number in range(n)], np.uint8).reshape(n, 3)
+
+
+def colours_of(ids: Integer[Array | np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n 3"]:
+    """Colours of these ids, as `id_colours` gives them, in memory by how many differ; below 0 is background. Host."""
+    present, place = np.unique(np.maximum(np.asarray(ids), 0), return_inverse=True)
+    table = np.array([_colour(number) for number in present.tolist()], np.uint8).reshape(-1, 3)
+    return table[place.reshape(np.shape(ids))]
+
+
+def _colour(number: int) -> tuple[int, int, int]:
+    if number == 0:
+        return 128, 128, 128
     # saturation and brightness change more slowly than the hue, so that a hue that returns looks different
-    hues = [(k * _GOLDEN % 1, (0.85, 0.5)[k // 8 % 2], (1.0, 0.7)[k // 16 % 2]) for k in range(n - 1)]
-    colours = [(0.5, 0.5, 0.5), *(colorsys.hsv_to_rgb(*hue) for hue in hues)]
-    return np.round(255 * np.array(colours[:n]).reshape(n, 3)).astype(np.uint8)
+    k = number - 1
+    red, green, blue = colorsys.hsv_to_rgb(k * _GOLDEN % 1, (0.85, 0.5)[k // 8 % 2], (1.0, 0.7)[k // 16 % 2])
+    return round(255 * red), round(255 * green), round(255 * blue)
 
 
-def id_image(object_weights: Float[Array, "*b h w m"], threshold: float = 0.5) -> Int[Array, "*b h w"]:
-    """The id with the largest share of each pixel; 0 where all objects together have at most `threshold`."""
+def id_image(
+    object_weights: Float[Array, "*b h w m"], threshold: float = 0.5, *, ids: Int[Array | np.ndarray, "m"] | None = None
+) -> Int[Array, "*b h w"]:
+    """The id with the largest share of each pixel; 0 where all objects together have at most `threshold`.
+
+    Args:
+        object_weights: share of each pixel.
+        threshold: of the sum of shares.
+        ids: the id of each channel; if not given, channel k is id k.
+    """
     winner = jnp.argmax(object_weights, -1).astype(jnp.int32)
+    winner = winner if ids is None else jnp.asarray(ids, jnp.int32)[winner]
     return jnp.where(jnp.sum(object_weights, -1) > threshold, winner, 0)
 
 
@@ -53,7 +75,7 @@ def overlay(
     if image.shape[:2] != ids.shape:
         raise InputError(f"ids have size {ids.shape}, the image {image.shape[:2]}: both must be [height, width].")
     base = _bytes(image).astype(float)
-    tint = id_colours(max(int(ids.max(initial=0)) + 1, 1))[np.maximum(ids, 0)]
+    tint = colours_of(ids).astype(float)
     strength = np.where(ids > 0, alpha, 0.0)
     if outline:
         strength = np.where(_edges(ids) & (ids > 0), 1.0, strength)
@@ -69,14 +91,13 @@ def legend_sheet(
     width: int = 320,
 ) -> UInt8[np.ndarray, "rows width 3"]:
     """Which id is which object: colour, id, name and, given a picture with its ids, a thumbnail per object, host."""
-    colours = id_colours(max(names, default=0) + 1)
     margin, inner = row_height // 8, row_height - 2 * (row_height // 8)
     sheet = Image.new("RGB", (width, row_height * max(len(names), 1)), "white")
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=row_height * 0.4)
     for row, (object_id, name) in enumerate(sorted(names.items())):
         top = row * row_height
         box = [margin, top + margin, margin + inner, top + margin + inner]
-        draw.rectangle(box, fill=tuple(map(int, colours[object_id])), outline="black")
+        draw.rectangle(box, fill=_colour(max(object_id, 0)), outline="black")
         left, middle = row_height + margin, top + row_height // 2
         if image is not None and ids is not None:
             thumbnail = _thumbnail(np.asarray(image), np.asarray(ids) == object_id, inner)

@@ -31,6 +31,7 @@ from pigjax.splat import (
 from pigjax.tile_walks import credits_of_candidates, soft_surface_depth
 
 _TIED_IDS = 4  # of more ids with equal votes, the lowest four compete
+_MOST_MEMORY = 2**35  # [bytes] of votes; more come from ids that number annotations rather than objects
 _IDS_TOGETHER = 32  # ids credited in one pass of weighting = "alpha", which bounds its memory
 
 
@@ -41,6 +42,7 @@ class Labels(eqx.Module):
     votes: Num[Array, "n m"] = array_field()  # views (or alpha·T, or soft counts) for each id, background in column 0
     confidence: Float[Array, "n"] = array_field()  # share of the votes that the winner took, 0 where never seen
     overflow: Int[Array, ""] | None = None  # box/tile pairs that the renderer dropped, over all views
+    ids: Int[Array, "m"] | None = None  # id of each column of `votes`; None: column k counts id k
 
 
 def lift_masks(
@@ -94,10 +96,11 @@ def lift_masks(
         config: the renderer's settings.
 
     Raises:
-        InputError: no views, masks that do not fit the cameras, ids or thresholds out of range, unknown options.
+        InputError: no views, masks that do not fit the cameras, ids or thresholds out of range, unknown options, or
+            votes that would take more than 32 GiB.
     """
     check_masks(cameras, masks)
-    _check_ids(masks, num_ids)
+    _check_ids(masks, num_ids, len(gaussians), len(cameras))
     _check_choice("background", background, ("ignore", "vote"))
     _check_choice("weighting", weighting, ("centre", "alpha"))
     _check_choice("ties", ties, ("alpha", "lowest"))
@@ -176,7 +179,10 @@ def fill_unseen(gaussians: Gaussians | Splats, labels: Labels, k: int = 8) -> La
     if k < 1:
         raise InputError(f"k = {k}: at least one neighbour is needed.")
     if not seen.any():
-        raise InputError("labels.object_id holds no seen Gaussian (all are -1): no neighbour can lend its id.")
+        raise InputError(
+            "labels.object_id holds no seen Gaussian (all are -1), so no neighbour can lend its id: do Gaussians and"
+            " cameras share one frame?"
+        )
     if not unseen.any():
         return labels
     k = min(k, int(seen.sum()))
@@ -189,7 +195,7 @@ def fill_unseen(gaussians: Gaussians | Splats, labels: Labels, k: int = 8) -> La
     ids[unseen] = neighbours[rows, best]
     confidence = np.array(labels.confidence)
     confidence[unseen] = agreement[rows, best] / k
-    return Labels(jnp.asarray(ids), labels.votes, jnp.asarray(confidence), labels.overflow)
+    return dataclasses.replace(labels, object_id=jnp.asarray(ids), confidence=jnp.asarray(confidence))
 
 
 def enough_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: RenderConfig) -> RenderConfig:
@@ -357,9 +363,15 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
         raise InputError(f"{name} = {value!r}: choose from {', '.join(choices)}.")
 
 
-def _check_ids(masks, num_ids: int) -> None:
+def _check_ids(masks, num_ids: int, count: int, views: int) -> None:
     if num_ids < 2:
         raise InputError(f"num_ids = {num_ids}: at least 2 are needed, the background and one object.")
+    needed = count * num_ids * np.dtype(np.min_scalar_type(views)).itemsize
+    if needed > _MOST_MEMORY:
+        raise InputError(
+            f"num_ids = {num_ids}: votes of {count} Gaussians would take {needed / 2**30:.0f} GiB; give the objects ids"
+            " that are the same in all views, or number those that occur (compact_ids)."
+        )
     high = int(np.asarray(masks).max()) if is_known(masks) else 0
     if high >= num_ids:
         raise InputError(

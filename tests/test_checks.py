@@ -146,7 +146,7 @@ ROWS = {
     "tau_T": ("segmentation.tau_T", 5, r"segmentation\.tau_T = 5\.0: it must be 1 or less"),
     "friction": ("simulation.contact_friction", -1, r"simulation\.contact_friction = -1\.0: it must be 0 or more"),
     "velocity": ("objects.duck.velocity", [math.nan, 0, 0], r"objects\.duck\.velocity\[0\] = nan: it must be finite"),
-    "big id": ("objects.duck.id", 2_000_000_000, r"objects\.duck\.id = 2000000000: it must be 65535 or less"),
+    "big id": ("objects.duck.id", 2**31, r"objects\.duck\.id = 2147483648: it must be 2147483647 or less"),
     "weight": ("clamp.lambda_R", math.nan, r"clamp\.lambda_R = nan: it must be finite"),
     "radius": ("camera.radius", 0, r"camera\.radius = 0\.0: it must be > 0 m"),
 }

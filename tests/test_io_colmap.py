@@ -173,14 +173,14 @@ def test_truncated_binary_is_named(tmp_path, part, keep):
     folder = dataset(tmp_path, "binary")
     file = folder / "sparse" / "0" / f"{part}.bin"
     file.write_bytes(file.read_bytes()[:keep])
-    with pytest.raises(InputError, match=rf"{part}\.bin: not a complete COLMAP file"):
+    with pytest.raises(InputError, match=rf"{part}\.bin: not a readable COLMAP file"):
         load_points(load_views(folder).points_path)
 
 
 def test_damaged_text_is_named(tmp_path):
     folder = dataset(tmp_path, "text")
     (folder / "sparse" / "0" / "images.txt").write_text("1 2 three\n")
-    with pytest.raises(InputError, match=r"images\.txt: not a complete COLMAP file"):
+    with pytest.raises(InputError, match=r"images\.txt: not a readable COLMAP file"):
         load_views(folder)
 
 

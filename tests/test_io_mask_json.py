@@ -252,7 +252,7 @@ def test_keys_that_are_names_and_numbers_are_refused(tmp_path):
 
 GOOD = rle(blocks()[0] == 1)
 BAD = {
-    "no JSON": ("{", r"v\.json: not valid JSON"),
+    "no JSON": ("{", r"v\.json: not a readable JSON file"),
     "no masks": ('{"names": ["a"]}', r"v\.json: holds no masks of one view"),
     "number": ("3", r"v\.json: holds no masks of one view"),
     "annotations": ('{"annotations": 3}', r"v\.json: 'annotations' is no list"),

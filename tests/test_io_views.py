@@ -284,7 +284,7 @@ def test_missing_and_unknown_places(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("{", r"a\.json: not valid JSON \(.*line 1"),
+        ("{", r"a\.json: not a readable JSON file \(.*line 1"),
         ('{"x": 1}', r"a\.json: neither transforms\.json .* nor cameras\.json"),
         ("3", r"a\.json: neither transforms\.json"),
     ],

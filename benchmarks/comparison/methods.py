@@ -118,7 +118,7 @@ def as_spring_gaus(setting: Setting, ids: np.ndarray) -> Motion:
 def lifted_ids(setting: Setting) -> np.ndarray:
     """Ids [n] of the training masks, as scenes get them."""
     train = setting.scene.train
-    labels = lift(setting.gaussians, train.cameras, train.masks, num_ids=setting.scene.num_ids)
+    labels = lift(setting.gaussians, train.cameras, train.masks)
     return np.asarray(labels.object_id)
 
 

@@ -126,7 +126,7 @@ def segment(
 
     cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid, origin=origin)
     loaded = io.load_views(views, masks=masks if masks is not None else True, origin=origin)
-    known = {} if names is None else {int(k): str(v) for k, v in io.read_json(names).items()}
+    known = {} if names is None else io.load_names(names)
     settings = _settings(tau_t, tau_d, weighting, purity, min_seen)
     counts = segment_files(cloud, loaded, known, out, fill=fill, remove=remove or (), origin=origin, **settings)
     table = Table("id", "object", "Gaussians")

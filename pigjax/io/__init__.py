@@ -10,7 +10,7 @@ from pigjax.io.archives import (
     write_parquet,
 )
 from pigjax.io.cameras import Views, load_cameras, load_views
-from pigjax.io.datasets import LAYOUTS, Dataset, load_dataset
+from pigjax.io.datasets import LAYOUTS, Dataset, id_named, load_dataset, load_names
 from pigjax.io.files import (
     decoding,
     output_folder,
@@ -39,6 +39,7 @@ __all__ = [
     "Views",
     "contact_sheet",
     "decoding",
+    "id_named",
     "last_state",
     "load_array",
     "load_arrays",
@@ -47,6 +48,7 @@ __all__ = [
     "load_gaussians",
     "load_labels",
     "load_masks",
+    "load_names",
     "load_ply",
     "load_points",
     "load_pytree",

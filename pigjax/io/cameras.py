@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -17,10 +18,10 @@ from PIL import Image
 
 from pigjax.camera import Camera
 from pigjax.errors import InputError, MissingFileError
-from pigjax.io.capture import Capture, Shot
+from pigjax.io.capture import Capture, Shot, check_positions, name_views, one_split_each
 from pigjax.io.colmap import find_model, read_model
 from pigjax.io.files import PathLike, existing, existing_folder, read_json
-from pigjax.io.images import Background, open_rgb
+from pigjax.io.images import Background, open_rgb, turned_by_exif
 from pigjax.io.json_cameras import read_inria_cameras, read_transforms
 from pigjax.io.mask_json import frame_order
 from pigjax.io.masks import load_masks
@@ -34,7 +35,7 @@ class Views(eqx.Module):
     """
 
     cameras: Camera  # batch of t
-    names: tuple[str, ...] = eqx.field(static=True)  # file names without suffix; with folders where they would repeat
+    names: tuple[str, ...] = eqx.field(static=True)  # file names without suffix; with it or folders if they repeat
     images: Float[np.ndarray | Array, "t h w 3"]  # RGB in 0..1
     masks: Int[np.ndarray | Array, "t h w"] | None  # object ids
     splits: tuple[str, ...] = eqx.field(static=True)  # "train", "test", ...
@@ -102,23 +103,32 @@ def load_views(
 
     Raises:
         MissingFileError: the file or a photo or mask does not exist.
-        InputError: unknown or damaged format, camera model that is no pinhole, pose that is not rigid, photos whose
-            size contradicts the camera or differs from view to view, no views in the split, or an unknown name.
+        InputError: unknown or damaged format, camera that is no pinhole, pose that is not rigid, cameras so far from
+            the origin that they coincide when rounded, photos whose size contradicts the camera or differs from view
+            to view, two entries with one photo, no views in the split, or an unknown name.
+
+    Warns of fields of the file that are not applied (`mask_path`), and of photos that EXIF turns.
     """
     capture = _read_capture(path, images, origin)
     splits = _splits(capture, hold_out)
     chosen = range(len(splits)) if split is None else _of_split(splits, split, str(path))
-    all_names = _names([shot.image for shot in capture.shots])
+    all_names = name_views(capture.shots)
+    for remark in capture.remarks:
+        warnings.warn(remark, stacklevel=2)
     if only is not None:
+        only = (only,) if isinstance(only, str) else only
         unknown = set(only) - {all_names[i] for i in chosen}
         if unknown:
             raise InputError(
                 f"{path}: has no view {min(unknown)!r} to load; choose among {', '.join(all_names[:4])}, ..."
             )
         chosen = [i for i in chosen if all_names[i] in only]
+        if not chosen:
+            raise InputError(f"only = {only!r}: names no view of {path}; choose among {', '.join(all_names[:4])}, ...")
     shots = [capture.shots[i] for i in chosen]
     sizes = [_target_size(shot, max_size) for shot in shots]
     _check_one_size(shots, sizes)
+    _warn_of_turned(shots)
     with ThreadPoolExecutor() as pool:
         pictures = list(pool.map(lambda shot, size: _picture(shot, size, background), shots, sizes))
     names = tuple(all_names[i] for i in chosen)
@@ -150,7 +160,7 @@ def load_cameras(
     shots = _read_capture(path, None, origin).shots
     sizes = [_target_size(shot, max_size) for shot in shots]
     _check_one_size(shots, sizes)
-    return _cameras(shots, sizes), _names([shot.image for shot in shots])
+    return _cameras(shots, sizes), name_views(shots)
 
 
 def _read_capture(path: PathLike, images: PathLike | None, origin: Origin | None) -> Capture:
@@ -181,7 +191,9 @@ def _read_folder(folder: Path, images: Path | None) -> Capture:
     blender = {split: folder / f"transforms_{split}.json" for split in ("train", "val", "test")}
     parts = [_read_json_capture(file, images, split) for split, file in blender.items() if file.is_file()]
     if parts:
-        return Capture(folder, tuple(shot for part in parts for shot in part.shots), parts[0].points)
+        remarks = dict.fromkeys(remark for part in parts for remark in part.remarks)
+        shots = one_split_each([shot for part in parts for shot in part.shots])
+        return Capture(folder, shots, parts[0].points, tuple(remarks))
     model = find_model(folder)
     if model is not None:
         roots = (folder, *folder.resolve().parents[:2])
@@ -227,23 +239,29 @@ def _check_one_size(shots: Sequence[Shot], sizes: Sequence[tuple[int, int]]) -> 
             )
 
 
+def _warn_of_turned(shots: Sequence[Shot]) -> None:
+    turned = [shot.image for shot in shots if os.path.isfile(shot.image) and turned_by_exif(shot.image)]
+    if turned:
+        warnings.warn(
+            f"{turned[0]}: EXIF turns this photo, as {len(turned)} of {len(shots)}; pixels are taken as stored, as"
+            " COLMAP takes them. If the cameras are of the turned photos, turn them for good and remove the tag.",
+            stacklevel=3,
+        )
+
+
 def _picture(shot: Shot, size: tuple[int, int], background: Background) -> Float[np.ndarray, "h w 3"]:
-    if not shot.image.is_file():
+    if not os.path.isfile(shot.image):  # Path.is_file raises where a name is too long
         raise MissingFileError(
             f"{shot.image}: no such photo, which {shot.where} names; put it there, or give their folder as images=."
         )
-    picture = open_rgb(shot.image, background=background)
-    if picture.size != shot.size:
-        raise InputError(
-            f"{shot.image}: image is {picture.width}x{picture.height} but its camera ({shot.where}) says"
-            f" {shot.size[0]}x{shot.size[1]}; give the photos the cameras were made for (max_size shrinks them)."
-        )
+    picture = open_rgb(shot.image, background=background, size=shot.size, camera=shot.where)
     if picture.size != size:
         picture = picture.resize(size, Image.Resampling.BOX)
     return np.asarray(picture, np.float32) / 255
 
 
 def _cameras(shots: Sequence[Shot], sizes: Sequence[tuple[int, int]]) -> Camera:
+    check_positions(shots)
     factors = np.array(sizes) / np.array([shot.size for shot in shots])
     return Camera(
         jnp.asarray(np.stack([shot.world_to_cam for shot in shots])),
@@ -251,11 +269,3 @@ def _cameras(shots: Sequence[Shot], sizes: Sequence[tuple[int, int]]) -> Camera:
         jnp.asarray(np.array([shot.centre for shot in shots]) * factors),
         *sizes[0],
     )
-
-
-def _names(photos: Sequence[Path]) -> tuple[str, ...]:
-    stems = tuple(photo.stem for photo in photos)
-    if len(set(stems)) == len(stems):
-        return stems
-    common = os.path.commonpath([photo.parent for photo in photos])
-    return tuple(photo.relative_to(common).with_suffix("").as_posix() for photo in photos)

@@ -2,17 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import re
+import warnings
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from itertools import takewhile
+from pathlib import Path, PurePosixPath
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from pigjax.errors import InputError
 
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+_PHOTO_SUFFIXES = frozenset(
+    (
+        ".png",
+        ".jpg",
+        ".jpeg",
+        ".webp",
+        ".tif",
+        ".tiff",
+        ".bmp",
+        ".gif",
+        ".ppm",
+        ".pgm",
+        ".exr",
+        ".jp2",
+        ".avif",
+        ".heic",
+    )
+)
+_LONGEST = 65535  # [px]
+_FAR_CENTRE = 100  # principal points this many image sides away come from a damaged file
+_FIELD = (1e-2, 1e6)  # focal length over image side: fields of view from 0.0001 to 179 degrees
+_COARSE, _TOO_COARSE = 1e-4, 1e-3  # rounding of camera positions over the extent of the cameras: warned of, refused
+_LENS_NUMBER = re.compile(r"k\d?|p\d|s\d|b\d|ftheta_p\d|distortion_params|distortion_coefficients|rolling_shutter")
+_LENS_FLAGS = ("is_fisheye", "fisheye", "latlong", "equirectangular", "orthographic")
 
 
 @dataclass(frozen=True)
@@ -35,32 +65,118 @@ class Capture:
     root: Path  # folder in which `object_mask` lies
     shots: tuple[Shot, ...]
     points: Path | None
+    remarks: tuple[str, ...] = ()  # of what the file says and nothing here applies, for a warning
 
 
-def find_image(folder: Path, name: str) -> Path:
-    """The photo called `name` in `folder`, whose suffix may be left out and whose leading folders may differ.
+def normal_path(name: str) -> str:
+    """One spelling of a path from a file: forward slashes, without "./", "//" and ".." where they can be resolved."""
+    path = name.replace("\\", "/")
+    return os.path.normpath(path).replace("\\", "/") if path else ""
 
-    When there is none, the path where it should be.
+
+def without_suffix(name: str) -> str:
+    """The name of a photo without its suffix; "frame.0001" keeps its number, which is the suffix of no picture."""
+    stem, suffix = os.path.splitext(name)
+    return stem if suffix.lower() in _PHOTO_SUFFIXES else name
+
+
+def find_images(folder: Path, names: Sequence[str], *, elsewhere: bool) -> list[Path]:
+    """The photo of each name in `folder`; where there is none, the path where it should be.
+
+    The suffix may be left out. Leading folders of a name may be left out where `folder` itself ends with them, or, with
+    `elsewhere`, where all names share them: a photo of the same file name from another folder is another photo.
+
+    Args:
+        folder: where the names start.
+        names: as the file spells them.
+        elsewhere: `folder` is not where the file says, but where the user says.
+
+    Raises:
+        InputError: a name without suffix fits two photos.
     """
-    parts = Path(name).parts
-    for start in range(len(parts)):
-        for suffix in _SUFFIXES:
-            candidate = folder.joinpath(*parts[start:])
-            candidate = candidate.with_name(candidate.name + suffix)
-            if candidate.is_file():
-                return candidate
+    paths = [PurePosixPath(normal_path(name)) for name in names]
+    columns = zip(*(path.parent.parts for path in paths)) if elsewhere else ()
+    shared = sum(1 for _ in takewhile(lambda column: len(set(column)) == 1, columns))
+    home = Path(os.path.abspath(folder)).parts
+    return [_find_image(folder, path, shared, home) for path in paths]
+
+
+def _find_image(folder: Path, name: PurePosixPath, shared: int, home: tuple[str, ...]) -> Path:
+    folders = name.parent.parts
+    own = [k for k in range(1, len(folders) + 1) if folders[:k] == home[-k:]]
+    if name.is_absolute() or re.match("[A-Za-z]:/", str(name)):  # from another place or machine, with the same folder
+        own += [k for k in range(len(folders), 0, -1) if folders[k - 1] == home[-1]]
+    for start in dict.fromkeys((0, *own, *range(1, shared + 1))):
+        wanted = folder.joinpath(*name.parts[start:])
+        found = [wanted.with_name(wanted.name + suffix) for suffix in _SUFFIXES] if wanted.name else []
+        found = [path for path in found if os.path.isfile(path)]  # Path.is_file raises where a name is too long
+        if found and found[0] != wanted and len({path.name.lower() for path in found}) > 1:
+            raise InputError(
+                f"{wanted}: may be {' or '.join(path.name for path in found)}; write the photo's suffix, or move one."
+            )
+        if found:
+            return found[0]
     return folder / name
+
+
+def name_views(shots: Sequence[Shot]) -> tuple[str, ...]:
+    """Names of the views: file names without suffix; with folders, then suffixes, where they would repeat.
+
+    Raises:
+        InputError: two entries have the same photo.
+    """
+    photos = [Path(os.path.abspath(shot.image)) for shot in shots]
+    first: dict[Path, Shot] = {}
+    for photo, shot in zip(photos, shots):
+        if photo in first:
+            raise InputError(
+                f"{shot.where}: has the photo {shot.image}, as {first[photo].where} has; remove one of the two."
+            )
+        first[photo] = shot
+    names = [without_suffix(photo.name) for photo in photos]
+    if len(set(names)) < len(names):
+        common = os.path.commonpath([photo.parent for photo in photos])
+        whole = [photo.relative_to(common).as_posix() for photo in photos]
+        names = [without_suffix(name) for name in whole]
+        counts = Counter(names)
+        names = [name if counts[name] == 1 else full for name, full in zip(names, whole)]
+    counts = Counter(names)
+    for name, shot in zip(names, shots):
+        if counts[name] > 1:
+            raise InputError(f"{shot.where}: two photos are named {name!r} without their suffix; rename one.")
+    return tuple(names)
+
+
+def one_split_each(shots: Sequence[Shot]) -> tuple[Shot, ...]:
+    """Shots of several files without those that a validation file shares with another.
+
+    Raises:
+        InputError: a photo is in the training and the test file.
+    """
+    kept: dict[Path, Shot] = {}
+    for shot in shots:
+        before = kept.get(shot.image)
+        if before is not None and {before.split, shot.split} == {"train", "test"}:
+            raise InputError(
+                f"{shot.where}: has the photo {shot.image} for {shot.split}, {before.where} has it for {before.split};"
+                " a view that is trained on cannot be scored: remove it from one."
+            )
+        if before is None or before.split == "val":
+            kept[shot.image] = shot
+        elif shot.split != "val":
+            raise InputError(f"{shot.where}: has the photo {shot.image}, as {before.where} has; remove one of the two.")
+    return tuple(kept.values())
 
 
 def rigid(matrix: Any, where: str) -> Float[np.ndarray, "4 4"]:
     """A pose of 3x4 or 4x4 numbers as 4x4 float64, once it is sure that it only turns and shifts.
 
     Raises:
-        InputError: wrong shape, not finite, singular, scaled, sheared or mirrored.
+        InputError: wrong shape, not finite, singular, scaled, sheared or mirrored, or a last row that is not 0 0 0 1.
     """
     try:
         pose = np.asarray(matrix, np.float64)
-    except ValueError:
+    except (ValueError, TypeError, OverflowError):
         raise InputError(f"{where}: has rows of different lengths; give 4 rows of 4 numbers.") from None
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0, 0, 0, 1]])
@@ -69,6 +185,8 @@ def rigid(matrix: Any, where: str) -> Float[np.ndarray, "4 4"]:
     if not np.isfinite(pose).all():
         raise InputError(f"{where}: holds NaN or inf; compute this pose again or remove the view.")
     rotation = pose[:3, :3]
+    if np.abs(rotation).max() > 1e6:
+        raise InputError(f"{where}: its 3x3 part is no rotation (numbers up to {np.abs(rotation).max():.3g}).")
     determinant = np.linalg.det(rotation)
     if abs(determinant) < 1e-6:
         raise InputError(f"{where}: a singular pose (determinant {determinant:.3g}); mend it or remove the view.")
@@ -76,34 +194,100 @@ def rigid(matrix: Any, where: str) -> Float[np.ndarray, "4 4"]:
         raise InputError(
             f"{where}: its 3x3 part is no rotation (determinant {determinant:.4g}); take scale, shear or mirror out."
         )
+    if not np.allclose(pose[3], [0, 0, 0, 1], rtol=0, atol=1e-4):
+        raise InputError(
+            f"{where}: its last row is {pose[3].tolist()}; it must be [0, 0, 0, 1]: write the pose by rows, and take"
+            " scale out."
+        )
+    pose[3] = 0, 0, 0, 1
     return pose
 
 
-def check_pinhole(model: str, coefficients: Mapping[str, float], where: str, known: tuple[str, ...]) -> None:
-    """Refuse lenses that bend straight lines.
+def check_positions(shots: Sequence[Shot]) -> None:
+    """Refuse cameras so far from the origin that floats of the present width round their distances away.
+
+    Positions are read as 64-bit floats and kept as JAX's default float. Rounding beyond 1e-4 of the cameras' extent
+    gives a warning, beyond 1e-3 an error; cameras that all stand in one place count as 10 m apart.
 
     Raises:
-        InputError: `model` is not in `known`, or a distortion coefficient is not zero.
+        InputError: the offset is too large; the message names it.
+    """
+    positions = np.stack([-shot.world_to_cam[:3, :3].T @ shot.world_to_cam[:3, 3] for shot in shots])
+    middle = np.median(positions, axis=0)
+    with np.errstate(over="ignore"):
+        extent = float(np.max(np.linalg.norm(positions - middle, axis=1))) * 2
+        farthest = float(np.max(np.linalg.norm(positions, axis=1)))
+    step = farthest * float(np.finfo(jnp.result_type(float)).eps)
+    if extent < 1e-9 * farthest:
+        extent = 10.0
+    if step <= _COARSE * extent < np.inf:
+        return
+    offset = ", ".join(f"{value:.10g}" for value in middle)
+    said = (
+        f"{shots[0].where.partition(': ')[0]}: cameras lie around ({offset}), {extent:.3g} m apart, where"
+        f" 32-bit floats are {step:.2g} m apart; subtract this offset from the camera positions and from the Gaussians"
+    )
+    if not step <= _TOO_COARSE * extent < np.inf:
+        raise InputError(said + ".")
+    warnings.warn(said + " for exact pictures.", stacklevel=4)
+
+
+def check_pinhole(model: str, fields: Mapping[str, Any], where: str, known: tuple[str, ...]) -> None:
+    """Refuse lenses that bend straight lines, and shutters that roll.
+
+    Args:
+        model: the camera model's name.
+        fields: fields or parameters of the camera by name; those that describe no lens are not looked at.
+        where: file and entry, for messages.
+        known: camera models that are pinholes without distortion.
+
+    Raises:
+        InputError: `model` is not in `known`, a distortion coefficient is not zero, or a flag names another lens.
     """
     if model not in known:
         raise InputError(
             f"{where}: camera model {model!r} is not known ({', '.join(known)}); undistort to PINHOLE first."
         )
-    for name, value in coefficients.items():
-        if value != 0:
+    for name, value in fields.items():
+        if (name in _LENS_FLAGS or _LENS_NUMBER.fullmatch(name)) and not _is_zero(value):
+            what = "" if name in _LENS_FLAGS or name == "rolling_shutter" else "distortion "
+            shown = "true" if value is True else f"{value}"
             raise InputError(
-                f"{where}: {model} has distortion {name} = {value:g}, which is not modelled; undistort the images first"
+                f"{where}: {model} has {what}{name} = {shown}, which is not modelled; undistort the images first"
                 " (for example colmap image_undistorter)."
             )
 
 
-def check_intrinsics(focal: tuple[float, float], size: tuple[int, int], where: str) -> None:
-    """Refuse cameras without an extent.
+def is_of_lens(name: str) -> bool:
+    """Whether a field says how the lens or the shutter departs from a pinhole."""
+    return name in _LENS_FLAGS or _LENS_NUMBER.fullmatch(name) is not None
+
+
+def _is_zero(value: Any) -> bool:
+    if isinstance(value, list | tuple):
+        return all(map(_is_zero, value))
+    return value is None or (isinstance(value, bool | int | float) and value == 0)
+
+
+def check_intrinsics(
+    focal: tuple[float, float], centre: tuple[float, float], size: tuple[int, int], where: str
+) -> None:
+    """Refuse cameras without an extent, and numbers that are no pixels.
 
     Raises:
-        InputError: focal length or image size is not positive and finite.
+        InputError: focal length or image size is not positive and finite, the focal length is below 1 % of the image
+            side or above 1e6 of them, a side is longer than 65535 px, or the principal point is not finite or 100
+            sides away.
     """
-    if not all(0 < f < np.inf for f in focal):
-        raise InputError(f"{where}: focal length is {focal} px; it must be > 0.")
     if min(size) < 1:
         raise InputError(f"{where}: image size is {size[0]}x{size[1]}; it must be at least 1x1.")
+    if max(size) > _LONGEST:
+        raise InputError(f"{where}: image size is {size[0]}x{size[1]}; sides must be at most {_LONGEST} px.")
+    if not all(0 < f < np.inf for f in focal):
+        raise InputError(f"{where}: focal length is {focal} px; it must be > 0.")
+    if not all(_FIELD[0] <= f / side <= _FIELD[1] for f, side in zip(focal, size)):
+        raise InputError(f"{where}: focal length is {focal} for {size[0]}x{size[1]} pixels; give it in pixels.")
+    if not all(abs(c) <= _FAR_CENTRE * side for c, side in zip(centre, size)):  # false for NaN
+        raise InputError(
+            f"{where}: principal point is {centre} for {size[0]}x{size[1]} pixels; give it in pixels from the top left."
+        )

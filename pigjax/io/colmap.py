@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import struct
+from collections import Counter
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pigjax.errors import InputError
-from pigjax.io.capture import Capture, Shot, check_intrinsics, check_pinhole, find_image, rigid
-from pigjax.io.files import existing
+from pigjax.io.capture import Capture, Shot, check_intrinsics, check_pinhole, find_images, rigid
+from pigjax.io.files import decoding, existing
 
 # Names of the parameters after the focal lengths and the principal point, in the order of COLMAP's model numbers.
 _PARAMETERS: dict[str, tuple[str, ...]] = {
@@ -43,6 +45,7 @@ class _Lens:
 class _Pose:
     """One entry of `images`."""
 
+    number: int
     name: str
     quat: tuple[float, ...]  # wxyz, world to camera
     shift: tuple[float, ...]
@@ -64,18 +67,18 @@ def read_model(model: Path, *, root: Path, images: Path | None = None) -> Captur
     """
     kind = ".bin" if (model / "images.bin").is_file() else ".txt"
     cameras_file, images_file = existing(model / f"cameras{kind}", "file"), existing(model / f"images{kind}", "file")
-    try:
-        lenses = dict(_binary_cameras(cameras_file) if kind == ".bin" else _text_cameras(cameras_file))
-    except (struct.error, ValueError, IndexError) as error:
-        raise _damaged(cameras_file, error) from None
-    try:
+    with _decoding(cameras_file):
+        numbered = list(_binary_cameras(cameras_file) if kind == ".bin" else _text_cameras(cameras_file))
+        lenses = dict(numbered)
+        _check_once([number for number, _ in numbered], "camera", cameras_file)
+    with _decoding(images_file):
         poses = list(_binary_images(images_file) if kind == ".bin" else _text_images(images_file))
-    except (struct.error, ValueError, IndexError) as error:
-        raise _damaged(images_file, error) from None
+        _check_once([pose.number for pose in poses], "image", images_file)
     for number, lens in lenses.items():
         _check_lens(lens, f"{cameras_file}: camera {number}")
-    folder = images or root / "images"
-    shots = tuple(_shot(pose, lenses, folder, images_file) for pose in sorted(poses, key=lambda pose: pose.name))
+    poses.sort(key=lambda pose: pose.name)
+    photos = find_images(images or root / "images", [pose.name for pose in poses], elsewhere=images is not None)
+    shots = tuple(_shot(pose, lenses, photo, images_file) for pose, photo in zip(poses, photos))
     points = (model / f"points3D{suffix}" for suffix in (".bin", ".txt", ".ply"))
     return Capture(root, shots, next((path for path in points if path.is_file()), None))
 
@@ -86,11 +89,9 @@ def read_points3d(path: Path) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarra
     Raises:
         InputError: the file is damaged, or a colour is not within 0..255.
     """
-    try:
+    with _decoding(path):
         rows = list(_binary_points(path) if path.suffix.lower() == ".bin" else _text_points(path))
         table = np.asarray(rows, np.float64).reshape(-1, 6)
-    except Exception as error:  # damage shows itself as almost anything
-        raise InputError(f"{path}: not a complete COLMAP file ({error}); copy or export the model again.") from error
     wrong = ~((table[:, 3:] >= 0) & (table[:, 3:] <= 255)).all(1)
     if wrong.any():
         row = int(wrong.argmax())
@@ -98,42 +99,49 @@ def read_points3d(path: Path) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarra
     return table[:, :3], np.asarray(table[:, 3:] / 255, np.float32)
 
 
-def _damaged(path: Path, error: Exception) -> InputError:
-    if isinstance(error, InputError):
-        return error
-    return InputError(f"{path}: not a complete COLMAP file ({error}); copy or export the model again.")
+def _decoding(path: Path) -> AbstractContextManager[None]:
+    return decoding(path, "COLMAP file", remedy="copy or export the model again")
+
+
+def _check_once(numbers: list[int], what: str, path: Path) -> None:
+    twice = [number for number, count in Counter(numbers).items() if count > 1]
+    if twice:
+        raise InputError(f"{path}: lists {what} {twice[0]} more than once; export the model again.")
 
 
 def _check_lens(lens: _Lens, where: str) -> None:
     names = _PARAMETERS.get(lens.model, ())
-    bends = {name: value for name, value in zip(names, lens.values) if name[0] in "kp"}
-    check_pinhole(lens.model, bends, where, _PINHOLES)
+    check_pinhole(lens.model, dict(zip(names, lens.values)), where, _PINHOLES)
     if len(lens.values) != len(names):
         raise InputError(f"{where}: {lens.model} has {len(names)} parameters, not {len(lens.values)}; export it again.")
-    check_intrinsics(_focal(lens), lens.size, where)
+    check_intrinsics(_focal(lens), _centre(lens), lens.size, where)
 
 
 def _focal(lens: _Lens) -> tuple[float, float]:
     return (lens.values[0], lens.values[_PARAMETERS[lens.model].index("cx") - 1])
 
 
-def _shot(pose: _Pose, lenses: dict[int, _Lens], folder: Path, file: Path) -> Shot:
+def _centre(lens: _Lens) -> tuple[float, float]:
+    first = _PARAMETERS[lens.model].index("cx")
+    return lens.values[first], lens.values[first + 1]
+
+
+def _shot(pose: _Pose, lenses: dict[int, _Lens], photo: Path, file: Path) -> Shot:
     where = f"{file}: image {pose.name!r}"
     if pose.lens not in lenses:
         raise InputError(f"{where}: names camera {pose.lens}, which the model lacks; export the model again.")
     lens = lenses[pose.lens]
-    first = _PARAMETERS[lens.model].index("cx")
-    centre = (lens.values[first], lens.values[first + 1])
     world_to_cam = np.eye(4)
     world_to_cam[:3, :3] = _rotation(np.asarray(pose.quat))
     world_to_cam[:3, 3] = pose.shift
-    return Shot(where, find_image(folder, pose.name), rigid(world_to_cam, where), _focal(lens), centre, lens.size)
+    return Shot(where, photo, rigid(world_to_cam, where), _focal(lens), _centre(lens), lens.size)
 
 
 def _rotation(quat: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
-    """Rotation of a wxyz quaternion of any length; zero gives zeros, which no pose check lets pass."""
-    length = np.linalg.norm(quat)
-    if length == 0:
+    """Rotation of a wxyz quaternion of any length; zero and overflow give NaN or zeros, which no check lets pass."""
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(quat)
+    if length == 0 or np.isposinf(length):
         return np.zeros((3, 3))
     w, axis = quat[0] / length, quat[1:] / length
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
@@ -141,23 +149,36 @@ def _rotation(quat: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
 
 
 def _text_lines(path: Path) -> list[str]:
-    return [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+    """Lines without comments; `splitlines` would cut names at rarer characters."""
+    return [line for line in path.read_text(encoding="utf-8-sig").split("\n") if not line.startswith("#")]
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, _Lens]]:
-    for line in filter(None, _text_lines(path)):
+    for line in filter(str.strip, _text_lines(path)):
         number, model, width, height, *values = line.split()
         yield int(number), _Lens(model, (int(width), int(height)), tuple(map(float, values)))
 
 
 def _text_images(path: Path) -> Iterator[_Pose]:
-    lines = iter(_text_lines(path))
-    for line in lines:
-        if line.strip():
-            _, w, x, y, z, *shift, lens, name = line.split(maxsplit=9)
+    """Poses, each in a line of its own; the line of observed points after it may be missing, as some tools write it."""
+    points_may_follow = False
+    for line in _text_lines(path):
+        if not line.strip() or (points_may_follow and _is_points(line)):
+            points_may_follow = False
+        else:
+            number, w, x, y, z, *shift, lens, name = line.split(maxsplit=9)
             quat = (float(w), float(x), float(y), float(z))
-            yield _Pose(name.strip(), quat, (float(shift[0]), float(shift[1]), float(shift[2])), int(lens))
-            next(lines, None)  # observed points: one line, empty where there are none
+            yield _Pose(int(number), name.strip(), quat, (float(shift[0]), float(shift[1]), float(shift[2])), int(lens))
+            points_may_follow = True
+
+
+def _is_points(line: str) -> bool:
+    """Whether a line holds X, Y and POINT3D_ID of observed points: numbers, by threes."""
+    values = line.split()
+    try:
+        return len(values) % 3 == 0 and all(map(np.isfinite, map(float, values)))
+    except ValueError:
+        return False
 
 
 def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
@@ -183,6 +204,11 @@ class _Reader:
         if self.at > len(self.data):
             raise ValueError(f"ends after {len(self.data)} bytes")
 
+    def finish(self) -> None:
+        """Refuse bytes after the last entry: their number was damaged."""
+        if self.at != len(self.data):
+            raise ValueError(f"{len(self.data) - self.at} bytes after the last entry")
+
     def text(self) -> str:
         end = self.data.index(b"\0", self.at)
         start, self.at = self.at, end + 1
@@ -200,16 +226,18 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, _Lens]]:
             )
         model = _BINARY_MODELS[kind]
         yield number, _Lens(model, (width, height), reader.take(f"{len(_PARAMETERS[model])}d"))
+    reader.finish()
 
 
 def _binary_images(path: Path) -> Iterator[_Pose]:
     reader = _Reader(path)
     for _ in range(*reader.take("Q")):
-        _, *quat_shift, lens = reader.take("I7dI")
+        number, *quat_shift, lens = reader.take("I7dI")
         name = reader.text()
         (observations,) = reader.take("Q")
         reader.skip(24 * observations)
-        yield _Pose(name, tuple(quat_shift[:4]), tuple(quat_shift[4:]), lens)
+        yield _Pose(number, name, tuple(quat_shift[:4]), tuple(quat_shift[4:]), lens)
+    reader.finish()
 
 
 def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:

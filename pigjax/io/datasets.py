@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,9 +12,10 @@ from jaxtyping import Bool, Int
 from pigjax.camera import Camera
 from pigjax.errors import InputError
 from pigjax.io.cameras import Views, load_cameras, load_views
-from pigjax.io.files import PathLike, existing, existing_folder, read_json
+from pigjax.io.capture import without_suffix
+from pigjax.io.files import PathLike, decoding, existing, existing_folder, read_json
 from pigjax.io.images import open_image
-from pigjax.io.mask_json import frame_order
+from pigjax.io.mask_json import ID_LIMIT, frame_order
 from pigjax.io.masks import load_masks
 
 Truth = Bool[np.ndarray, "_ _"]  # of the size that it is stored in
@@ -109,17 +110,40 @@ def load_dataset(
 
 
 def load_names(path: PathLike) -> dict[int, str]:
-    """Names of ids from JSON {id: name}.
+    """Names of ids from JSON {id: name}; ids are whole numbers from 0 to 2³¹ - 1.
 
     Raises:
         MissingFileError: there is no such file.
-        InputError: the file is no JSON of that form.
+        InputError: the file is no JSON of that form, or an id is written twice.
     """
     content = read_json(path)
-    try:
-        return {int(number): str(name) for number, name in content.items()}
-    except (AttributeError, ValueError):
-        raise InputError(f'{path}: is not {{id: name}}; write for example {{"1": "table"}}.') from None
+    example = 'write for example {"1": "table"}'
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: is not {{id: name}}; {example}.")
+    names: dict[int, str] = {}
+    for key, name in content.items():
+        if not (key.isascii() and key.isdigit() and len(key) <= 18 and int(key) < ID_LIMIT):
+            reversed_too = not isinstance(name, bool) and isinstance(name, int)
+            reason = "but {name: id}" if reversed_too else f"since {key[:40]!r} is no id from 0 to 2³¹ - 1"
+            raise InputError(f"{path}: is not {{id: name}}, {reason}; {example}.")
+        if not isinstance(name, str) or not name.strip():
+            raise InputError(f"{path}: the name of id {key} is {name!r}; {example}.")
+        if int(key) in names:
+            raise InputError(f"{path}: id {int(key)} is written twice; keep one name for it.")
+        names[int(key)] = name
+    return names
+
+
+def id_named(name: str, names: Mapping[int, str]) -> int | None:
+    """The id of a name, None where there is none.
+
+    Raises:
+        InputError: several ids have this name.
+    """
+    found = [number for number, known in names.items() if known == name]
+    if len(found) > 1:
+        raise InputError(f"{name!r} is the name of the ids {', '.join(map(str, found))}; name one of them otherwise.")
+    return found[0] if found else None
 
 
 def _lerf_mask(root: Path, views: Sequence[str]) -> _Truths:
@@ -127,7 +151,7 @@ def _lerf_mask(root: Path, views: Sequence[str]) -> _Truths:
     folders = sorted(folder for folder in truths.iterdir() if folder.is_dir())
     train = root / "images_train"
     if train.is_dir():
-        kept = {photo.stem for photo in train.iterdir()}
+        kept = {without_suffix(photo.name) for photo in train.iterdir()}
         test = [view for view in views if view not in kept]
     elif all(folder.name in views for folder in folders):
         test = [folder.name for folder in folders]
@@ -152,10 +176,12 @@ def _view_of(folder: Path, views: Sequence[str], test: Sequence[str]) -> str:
 
 def _3d_ovs(root: Path, views: Sequence[str]) -> _Truths:
     truths = existing_folder(root / "segmentations", "folder of truth masks (3D-OVS)")
-    lines = existing(truths / "classes.txt", "list of classes").read_text(encoding="utf-8").splitlines()
+    listing = existing(truths / "classes.txt", "list of classes")
+    with decoding(listing, "list of classes", remedy="write it in UTF-8"):
+        lines = listing.read_text(encoding="utf-8-sig").splitlines()
     classes = sorted({line.strip() for line in lines} - {""})
     files = sorted(existing_folder(root / "images", "folder of photos").iterdir())
-    photos = [file.stem for file in files if file.suffix.lower() in _PHOTOS]
+    photos = [without_suffix(file.name) for file in files if file.suffix.lower() in _PHOTOS]
     masks: dict[tuple[str, str], Truth] = {}
     for folder in sorted(folder for folder in truths.iterdir() if folder.is_dir()):
         if not folder.name.isdigit() or int(folder.name) >= len(photos):

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float, UInt8
-from PIL import Image
+from PIL import Image, ImageOps
 
 from pigjax.errors import InputError
-from pigjax.io.files import PathLike, existing, writing
+from pigjax.io.files import PathLike, decoding, existing, writing
 
+_ORIENTATION = 0x0112  # EXIF tag: 1 as stored, 2 to 4 mirrored or upside down, 5 to 8 width and height exchanged
+_SIDEWAYS = 5
+_MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX")
 Background = float | int | tuple[float, float, float]
 # [h w 3] or [h w]; sizes have no names, so that a bad frame meets our own message rather than a type checker's.
 Picture = Float[Array | np.ndarray, "_ _ ..."] | UInt8[Array | np.ndarray, "_ _ ..."]
@@ -27,37 +32,104 @@ def read_image(path: PathLike, *, background: Background = 0.0) -> Float[np.ndar
     return np.asarray(open_rgb(path, background=background), np.float32) / 255
 
 
-def open_image(path: PathLike) -> Image.Image:
+def open_image(path: PathLike, *, check: Callable[[int, int], None] | None = None) -> Image.Image:
     """A decoded picture as it was stored.
 
+    Args:
+        path: the picture.
+        check: given the width and height [px] that the file claims, before memory is asked for; may raise.
+
     Raises:
         MissingFileError: there is no such file.
-        InputError: the file is not a picture, or is damaged.
+        InputError: the file is not a picture, is damaged, or holds several pictures, or `check` says so.
     """
     path = existing(path, "image")
-    try:
-        with Image.open(path) as image:
-            image.load()
-            return image
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path}: not a readable image ({error}); replace the file or export it again.") from None
+    with _decoding(path), Image.open(path) as image:
+        if check is not None:
+            check(*image.size)
+        if getattr(image, "is_animated", False) and image.format != "MPO":  # a phone's second picture is a preview
+            raise InputError(f"{path}: holds several pictures; export the one that is meant.")
+        image.load()
+        return image
 
 
-def open_rgb(path: PathLike, *, background: Background) -> Image.Image:
-    """A decoded picture in 8-bit RGB, composited onto `background` where it is transparent.
+def image_size(path: PathLike) -> tuple[int, int]:
+    """Width and height [px] of a picture, which is not decoded.
 
     Raises:
         MissingFileError: there is no such file.
-        InputError: the file is not an 8-bit picture, or is damaged.
+        InputError: the file is not a picture.
     """
-    image = open_image(path)
+    path = existing(path, "image")
+    with _decoding(path), Image.open(path) as image:
+        return image.size
+
+
+@contextmanager
+def _decoding(path: PathLike) -> Iterator[None]:
+    with decoding(path, "image", remedy="replace the file or export it again"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # twice as much raises
+        try:
+            yield
+        except OSError as error:  # what Pillow says of damage
+            raise ValueError(str(error)) from error
+
+
+def open_rgb(
+    path: PathLike, *, background: Background, size: tuple[int, int] | None = None, camera: str = ""
+) -> Image.Image:
+    """A decoded picture in 8-bit RGB, composited onto `background` where it is transparent.
+
+    Args:
+        path: the picture.
+        background: colour behind it, in 0..1.
+        size: width and height that it must have [px]; a picture that has them only once it is turned as its EXIF says
+            is turned. Not given: any, as stored.
+        camera: file and entry that ask for this size, for messages.
+
+    Raises:
+        MissingFileError: there is no such file.
+        InputError: the file is not an 8-bit picture, is damaged, or has another size.
+    """
+
+    def check(*stored: int) -> None:
+        if size is not None and size not in (stored, stored[::-1]):
+            raise _wrong_size(path, stored, size, camera)
+
+    image = open_image(path, check=check)
+    if size is not None and image.size != size and image.getexif().get(_ORIENTATION, 1) >= _SIDEWAYS:
+        image = ImageOps.exif_transpose(image)
+    if size is not None and image.size != size:
+        raise _wrong_size(path, image.size, size, camera)
     if image.mode.startswith("I") or image.mode == "F":
         raise InputError(f"{path}: has more than 8 bits per channel (mode {image.mode}); export it as 8-bit RGB.")
+    if image.mode not in _MODES:
+        raise InputError(f"{path}: has its colours in {image.mode}; export it as 8-bit RGB.")
     if image.has_transparency_data:
         image = image.convert("RGBA")
         colour = to_uint8(np.broadcast_to(np.asarray(background, np.float32), 3))
         image = Image.alpha_composite(Image.new("RGBA", image.size, (*colour.tolist(), 255)), image)
     return image.convert("RGB")
+
+
+def turned_by_exif(path: PathLike) -> bool:
+    """Whether EXIF asks to turn or mirror a picture in a way that its size does not tell.
+
+    Raises:
+        MissingFileError: there is no such file.
+        InputError: the file is not a picture.
+    """
+    path = existing(path, "image")
+    with _decoding(path), Image.open(path) as image:
+        orientation = image.getexif().get(_ORIENTATION, 1)
+        return 1 < orientation < _SIDEWAYS or (_SIDEWAYS <= orientation <= 8 and image.width == image.height)
+
+
+def _wrong_size(path: PathLike, stored: tuple[int, ...], size: tuple[int, int], camera: str) -> InputError:
+    return InputError(
+        f"{path}: image is {stored[0]}x{stored[1]} but its camera ({camera}) says {size[0]}x{size[1]}; give the photos"
+        " the cameras were made for (max_size shrinks them)."
+    )
 
 
 def write_image(path: PathLike, image: Picture) -> None:

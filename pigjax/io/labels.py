@@ -22,6 +22,7 @@ class StoredLabels(NamedTuple):
     object_id: Integer[np.ndarray, "n"]  # 0 = background or contested, -1 = never seen
     votes: Num[np.ndarray, "n m"]
     confidence: Float[np.ndarray, "n"]
+    ids: Integer[np.ndarray, "m"] | None = None  # id of each column of `votes`; None: column k counts id k
 
 
 def save_labels(
@@ -29,6 +30,7 @@ def save_labels(
     object_id: Integer[np.ndarray | Array, "n"],
     votes: Num[np.ndarray | Array, "n m"],
     confidence: Float[np.ndarray | Array, "n"],
+    ids: Integer[np.ndarray | Array, "m"] | None = None,
 ) -> None:
     """Write labels as `.npz`, whole or not at all. Host.
 
@@ -37,11 +39,13 @@ def save_labels(
         object_id: object of each Gaussian; 0 is background or contested, -1 never seen.
         votes: views, or sums of alpha·T, for each id.
         confidence: share of the votes that the winner took, 0 to 1.
+        ids: id of each column of `votes`; None: column k counts id k.
 
     Raises:
         InputError: the file cannot be written.
     """
-    save_arrays(path, {"object_id": object_id, "votes": votes, "confidence": confidence})
+    columns = {} if ids is None else {"ids": ids}
+    save_arrays(path, {"object_id": object_id, "votes": votes, "confidence": confidence, **columns})
 
 
 def load_labels(path: PathLike, count: int | None = None) -> StoredLabels:
@@ -67,7 +71,7 @@ def load_labels(path: PathLike, count: int | None = None) -> StoredLabels:
         if error.__cause__ is None:
             raise
         raise InputError(f"{path}: not the {_WHAT} ({error.__cause__}); {_REMEDY}.") from error
-    labels = StoredLabels(*(arrays[name] for name in StoredLabels._fields))
+    labels = StoredLabels(*(arrays.get(name) for name in StoredLabels._fields))
     lowest, highest = int(labels.object_id.min(initial=0)), int(labels.object_id.max(initial=0))
     if not -1 <= lowest <= highest < 2**31:
         raise InputError(f"{path}: object_id reaches from {lowest} to {highest}, not from -1 to 2³¹ - 1; {_REMEDY}.")
@@ -75,13 +79,15 @@ def load_labels(path: PathLike, count: int | None = None) -> StoredLabels:
         raise InputError(f"{path}: votes are negative or not finite; {_REMEDY}.")
     if not ((labels.confidence >= 0) & (labels.confidence <= 1 + 1e-3)).all():  # sums of shares are rounded
         raise InputError(f"{path}: confidence is not a share from 0 to 1; {_REMEDY}.")
-    return StoredLabels(labels.object_id.astype(np.int32), labels.votes, labels.confidence)
+    return labels._replace(object_id=labels.object_id.astype(np.int32))
 
 
 def _check_headers(path: PathLike, headers: Mapping[str, ArrayHeader], count: int | None) -> None:
     """Refuse arrays of another type or size before they are read."""
     kinds = {"object_id": ("iu", 1, "whole numbers [n]"), "votes": ("iuf", 2, "numbers [n m]")}
     kinds["confidence"] = ("f", 1, "real numbers [n]")
+    if "ids" in headers:
+        kinds["ids"] = ("iu", 1, "whole numbers [m]")
     missing = [name for name in kinds if name not in headers]
     if missing:
         raise InputError(f"{path}: not the {_WHAT} (it has no {missing[0]}); {_REMEDY}.")
@@ -91,7 +97,11 @@ def _check_headers(path: PathLike, headers: Mapping[str, ArrayHeader], count: in
             raise InputError(
                 f"{path}: not the {_WHAT} ({name} is {found.dtype} {list(found.shape)}, not {wanted}); {_REMEDY}."
             )
-    rows = {name: headers[name].shape[0] for name in kinds}
+    rows = {name: headers[name].shape[0] for name in kinds if name != "ids"}
+    if "ids" in headers and headers["ids"].shape[0] != headers["votes"].shape[1]:
+        raise InputError(
+            f"{path}: ids name {headers['ids'].shape[0]} columns of {headers['votes'].shape[1]}; {_REMEDY}."
+        )
     if count is not None and rows["object_id"] != count:
         raise InputError(f"{path}: labels {rows['object_id']} Gaussians, the scene has {count}; segment it again.")
     if len(set(rows.values())) > 1:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -12,9 +13,11 @@ from PIL import Image
 from scipy import ndimage
 
 from pigjax.errors import InputError, MissingFileError
-from pigjax.io.files import PathLike, existing, existing_folder, read_json, writing
+from pigjax.io.files import PathLike, decoding, existing, existing_folder, read_json, writing
 from pigjax.io.images import open_image
-from pigjax.io.mask_json import Segments, frame_order, paint, read_view, read_views
+from pigjax.io.mask_json import ID_LIMIT, Segments, frame_order, paint, read_view, read_views
+
+_LONGEST = 8192  # [px] of a mask's side, where its view is small
 
 
 def load_masks(
@@ -54,12 +57,18 @@ def load_masks(
 
     Raises:
         MissingFileError: the folder, or the mask of a view, does not exist.
-        InputError: a mask is damaged, has another aspect ratio than the view, or holds no ids.
+        InputError: a mask is damaged, has another aspect ratio than the view or is far larger, or holds no ids; ids
+            outside 0..2³¹ - 1; names that repeat; or a view with a .png and a .npy.
     """
     if missing not in ("error", "empty"):
         raise InputError(f"missing = {missing!r}: choose 'error' or 'empty'.")
     if holes < 0:
         raise InputError(f"holes = {holes}: give the most pixels that a hole may have, or 0.")
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise InputError(
+            f"names hold {twice[0]!r} {names.count(twice[0])} times; views that share a name share a mask."
+        )
     find = _finder(folder, names, frame_order(names) if frames is None else frames, id_field)
     width, height = size
     masks = np.zeros((len(names), height, width), np.int32)
@@ -67,9 +76,11 @@ def load_masks(
     for mask, name in zip(masks, names):
         found = find(name)
         if found is not None:
-            where, ids = _read_ids(found, (height, width))
-            resized += [where] if ids.shape != mask.shape else []
-            mask[:] = _nearest(_filled(ids, holes), size, where)
+            entry = found if isinstance(found, Path) else f"{folder}: view {name!r}"
+            with decoding(entry, "mask", remedy="save the mask again"):
+                where, ids = _read_ids(found, (height, width))
+                resized += [where] if ids.shape != mask.shape else []
+                mask[:] = _nearest(_filled(ids, holes), size)
         elif missing == "error":
             raise MissingFileError(
                 f"{folder}: no mask for view '{name}' ({name}.png or {name}.npy) nor in JSON; add it,"
@@ -118,6 +129,8 @@ def _finder(
 
     def find(name: str) -> Path | Segments | None:
         path = files[name]
+        if path is not None and path.suffix == ".png" and path.with_name(f"{path.stem}.npy").is_file():
+            raise InputError(f"{path}: the view has a mask {path.stem}.npy as well; keep the one that is meant.")
         return read_view(path, id_field) if path is not None and path.suffix == ".json" else path
 
     return find
@@ -125,29 +138,44 @@ def _finder(
 
 def _read_ids(found: Path | Segments, size: tuple[int, int]) -> tuple[Path | str, Int[np.ndarray, "h w"]]:
     """Where the ids of a view come from, and the ids; `size` is the height and width of the view."""
+
+    def check(where: Path | str, rows: int, columns: int) -> None:
+        _check_size(where, (rows, columns), size)
+
     if isinstance(found, list):
         where: Path | str = found[0].where if found else ""
-        ids: np.ndarray = paint(found, size)
         lowest = min((segment.object_id for segment in found), default=1)
         if lowest < 1:
             raise InputError(f"{where}: object id {lowest} is not > 0, which is the background; choose an id_field.")
+        ids: np.ndarray = paint(found, size, check=check)
     else:
         where = found
-        ids = _read_array(found) if found.suffix == ".npy" else np.asarray(open_image(found))
-        if ids.ndim == 3:
-            ids = _deva_ids(found, ids)
+        ids = _read_array(found, check) if found.suffix == ".npy" else _read_picture(found, check)
     if ids.ndim != 2 or not (np.issubdtype(ids.dtype, np.integer) or ids.dtype == bool):
         raise InputError(f"{where}: mask is {ids.dtype} {ids.shape}; save whole-number ids [h, w].")
-    if ids.size and not 0 <= ids.min() <= ids.max() < 2**31:
+    if ids.size == 0:
+        raise InputError(f"{where}: mask has no pixels {ids.shape}; save it again.")
+    if not 0 <= ids.min() <= ids.max() < ID_LIMIT:
         raise InputError(f"{where}: mask ids reach from {ids.min()} to {ids.max()}; use 0 (background) to 2³¹ - 1.")
     return where, ids.astype(np.int32)
 
 
-def _read_array(path: Path) -> np.ndarray:
-    try:
-        return np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: not a readable .npy array ({error}); save the mask again.") from None
+def _read_array(path: Path, check: Callable[[Path, int, int], None]) -> np.ndarray:
+    with decoding(path, ".npy array", remedy="save the mask again"):
+        stored = np.load(path, mmap_mode="r", allow_pickle=False)  # mapped: a shape beyond the file asks for no memory
+        if stored.ndim == 2:
+            check(path, *stored.shape)
+            return np.array(stored)
+    raise InputError(f"{path}: mask is {stored.dtype} {stored.shape}; save whole-number ids [h, w].")
+
+
+def _read_picture(path: Path, check: Callable[[Path, int, int], None]) -> np.ndarray:
+    picture = open_image(path, check=lambda width, height: check(path, height, width))
+    if picture.mode in ("RGB", "RGBA"):
+        return _deva_ids(path, np.asarray(picture))
+    if picture.mode in ("1", "L", "P") or picture.mode.startswith("I"):
+        return np.asarray(picture)
+    raise InputError(f"{path}: mask has pixels of kind {picture.mode}; save ids as single-channel PNG.")
 
 
 def _deva_ids(path: Path, rgb: np.ndarray) -> Int[np.ndarray, "h w"]:
@@ -158,9 +186,10 @@ def _deva_ids(path: Path, rgb: np.ndarray) -> Int[np.ndarray, "h w"]:
             " save ids as single-channel PNG."
         )
     ids = rgb[..., :3].astype(np.int32) @ np.array([1, 256, 65536], np.int32)
+    content = read_json(listing)
     try:
-        known = {segment["id"] for entry in read_json(listing)["annotations"] for segment in entry["segments_info"]}
-    except (KeyError, TypeError):
+        known = {segment["id"] for entry in content["annotations"] for segment in entry["segments_info"]}
+    except (KeyError, TypeError, IndexError):
         raise InputError(f"{listing}: has no annotations[].segments_info[].id; give the pred.json of DEVA.") from None
     unknown = set(np.unique(ids).tolist()) - known - {0}
     if unknown:
@@ -186,21 +215,34 @@ def _filled(ids: Int[np.ndarray, "h w"], most: int) -> Int[np.ndarray, "h w"]:
     return ids + np.append(0, np.where(closed, owner, 0)).astype(np.int32)[pieces]
 
 
-def _nearest(ids: np.ndarray, size: tuple[int, int], path: Path | str) -> np.ndarray:
-    width, height = size
-    rows, columns = ids.shape
+def _check_size(where: Path | str, shape: tuple[int, int], size: tuple[int, int]) -> None:
+    """Refuse a mask that cannot be of its view, by the height and width of both, before it is decoded."""
+    (rows, columns), (height, width) = shape, size
     # One pixel of rounding is fair on either side; more means that the mask is of another picture.
     if abs(columns * height - rows * width) > max(width + height, rows + columns):
         raise InputError(
-            f"{path}: mask is {columns}x{rows} but its view is {width}x{height}, another aspect ratio;"
+            f"{where}: mask is {columns}x{rows} but its view is {width}x{height}, another aspect ratio;"
             " give the mask of this view."
         )
+    if max(rows, columns) > max(_LONGEST, 4 * max(height, width)):
+        raise InputError(
+            f"{where}: mask is {columns}x{rows} but its view is {width}x{height}; give masks of at most"
+            f" {_LONGEST} px a side, or four times the view's."
+        )
+
+
+def _nearest(ids: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    width, height = size
+    rows, columns = ids.shape
     at_row = (np.arange(height) * 2 + 1) * rows // (2 * height)
     at_column = (np.arange(width) * 2 + 1) * columns // (2 * width)
     return ids[at_row[:, None], at_column]
 
 
 def _merged(masks: np.ndarray, merge: Mapping[int, int]) -> np.ndarray:
+    for number in merge.values():
+        if not 0 <= number < ID_LIMIT:
+            raise InputError(f"merge = {dict(merge)}: {number} is no id; use 0 (background) to 2³¹ - 1.")
     merged = masks.copy() if merge else masks
     for old, new in merge.items():
         merged[masks == old] = new

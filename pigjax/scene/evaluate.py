@@ -65,7 +65,8 @@ def evaluate_files(
     if labels is None:
         lifted = _lift(gaussians, dataset, fill=fill, **settings)
     else:
-        lifted = Labels(*map(jnp.asarray, io.load_labels(labels, len(gaussians))))
+        stored = io.load_labels(labels, len(gaussians))
+        lifted = Labels(*(None if array is None else jnp.asarray(array) for array in stored))
         lifted = fill_unseen(gaussians, lifted) if fill else lifted
     progress("lift", 1, 1)
     cameras = {view: dataset.test.cameras[i] for i, view in enumerate(dataset.test.names)}
@@ -101,8 +102,7 @@ def _grounding(
         given = _read_prompts(prompts)
         return {prompt: given.get(prompt) for prompt in wanted}, f"ids given in {prompts.name}"
     if dataset.names and reference is None:
-        named = {name: number for number, name in dataset.names.items()}
-        return {prompt: named.get(prompt) for prompt in wanted}, "ids named in names.json"
+        return {prompt: io.id_named(prompt, dataset.names) for prompt in wanted}, "ids named in names.json"
     view = reference_view(dataset.truths) if reference is None else reference
     if view not in cameras:
         raise InputError(f"reference = {view!r}: no view with truth; choose among {', '.join(cameras)}.")
@@ -114,9 +114,11 @@ def _grounding(
 
 def _read_prompts(path: Path) -> dict[str, int]:
     content = io.read_json(path)
-    sound = isinstance(content, dict) and all(type(number) is int and number > 0 for number in content.values())
+    sound = isinstance(content, dict) and all(type(number) is int and 0 < number < 2**31 for number in content.values())
     if not sound:
-        raise InputError(f'{path}: is not {{prompt: id}} with ids > 0; write for example {{"green apple": 3}}.')
+        raise InputError(
+            f'{path}: is not {{prompt: id}} with ids > 0 and < 2³¹; write for example {{"green apple": 3}}.'
+        )
     return content
 
 

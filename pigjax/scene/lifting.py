@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Integer
 
+from pigjax.association import compact_ids
 from pigjax.camera import Camera
 from pigjax.errors import InputError
 from pigjax.segmentation import Labels, fill_unseen, lift_masks
 from pigjax.splat import Gaussians
-
-_MOST_IDS = 65536  # votes are counted per Gaussian and id
 
 
 def lift(
@@ -20,22 +21,35 @@ def lift(
     cameras: Camera,
     masks: Integer[Array | np.ndarray, "t h w"],
     *,
-    num_ids: int = 2,
     fill: bool = True,
     **settings: Any,
 ) -> Labels:
-    """`lift_masks` for all ids that occur, at least `num_ids`; the unseen take their neighbours' id. Host.
+    """`lift_masks` for the ids that occur, in memory by their number; the unseen take their neighbours' id. Host.
 
     With `min_seen` nothing is filled: what is hidden on purpose would come back.
 
+    Args:
+        gaussians: the scene.
+        cameras: batch of posed views.
+        masks: id of every pixel, 0 = background; ids may lie far apart.
+        fill: give Gaussians that no view saw the id of their neighbours.
+        settings: of `lift_masks`, but for `num_ids`.
+
+    Returns:
+        Labels whose `object_id` are the ids of the masks. Where these are not 0, 1, 2, ..., `Labels.ids` says which id
+        each column of the votes counts.
+
     Raises:
-        InputError: ids beyond 65535, or as `lift_masks` raises it.
+        InputError: no camera sees a Gaussian, or as `lift_masks` raises it.
     """
-    highest = int(np.max(masks, initial=0))
-    if highest >= _MOST_IDS:
+    compact, ids = compact_ids(masks)
+    labels = lift_masks(gaussians, cameras, compact, num_ids=max(len(ids), 2), **settings)
+    if len(labels.object_id) and not np.any(labels.votes):
         raise InputError(
-            f"masks hold the id {highest}, which numbers annotations rather than objects; give the objects ids below"
-            f" {_MOST_IDS} that are the same in all views (compact_ids numbers them anew)."
+            "no camera sees a Gaussian: do the .ply and the cameras share one frame (origin, axes and scale)?"
         )
-    labels = lift_masks(gaussians, cameras, masks, num_ids=max(highest + 1, num_ids), **settings)
+    if ids[-1] >= len(ids):
+        number = np.asarray(labels.object_id)
+        object_id = np.where(number < 0, -1, ids[np.maximum(number, 0)]).astype(np.int32)
+        labels = replace(labels, object_id=jnp.asarray(object_id), ids=jnp.asarray(ids, jnp.int32))
     return fill_unseen(gaussians, labels) if fill and settings.get("min_seen") is None else labels

@@ -16,7 +16,7 @@ from pigjax.checks import suggest
 from pigjax.editing import extract_object, hole_mask, remove_object
 from pigjax.errors import InputError
 from pigjax.io.files import existing
-from pigjax.overlay import id_colours, id_image, legend_sheet, overlay
+from pigjax.overlay import colours_of, id_image, legend_sheet, overlay
 from pigjax.pruning import contributions
 from pigjax.scene.lifting import lift
 from pigjax.scene.schema import load_scene
@@ -70,18 +70,17 @@ def segment_files(
     train = views.subset("train") if "train" in views.splits else views
     assert train.masks is not None
     labels = lift(gaussians, train.cameras, train.masks, fill=fill, **settings)
-    num_ids = labels.votes.shape[1]
     object_id = np.asarray(labels.object_id)
-    io.save_labels(out / "labels.npz", object_id, labels.votes, labels.confidence)
+    io.save_labels(out / "labels.npz", object_id, labels.votes, labels.confidence, labels.ids)
     counts = {int(number): int(np.sum(object_id == number)) for number in np.unique(object_id)}
     for number in counts:
         io.save_ply(
             out / "objects" / f"{_stem(number, names)}.ply", extract_object(gaussians, labels, number), origin=origin
         )
-    colours = id_colours(num_ids)[np.maximum(object_id, 0)] / 255
+    colours = colours_of(object_id) / 255
     flat = jnp.asarray((colours - 0.5) / _SH_CONSTANT, jnp.float32)[:, None]
     io.save_ply(out / "coloured.ply", eqx.tree_at(lambda g: g.sh, gaussians, flat), origin=origin)
-    io.write_image(out / "objects.png", _sheet(gaussians, views, object_id, num_ids, names))
+    io.write_image(out / "objects.png", _sheet(gaussians, views, object_id, names))
     for number in doomed:
         _remove(gaussians, labels, number, views, out / "removed", _stem(number, names), origin)
     return counts
@@ -92,10 +91,12 @@ def _stem(number: int, names: dict[int, str]) -> str:
 
 
 def _id_of(name: str, names: dict[int, str]) -> int:
-    known = {called: number for number, called in names.items()}
-    if name in known or name.isdecimal():
-        return known[name] if name in known else int(name)
-    raise InputError(f"--remove {name}: {suggest(name, known) if known else 'give its id, or names'}.")
+    found = io.id_named(name, names)
+    if found is not None:
+        return found
+    if name.isascii() and name.isdecimal() and len(name) <= 10:
+        return int(name)
+    raise InputError(f"--remove {name}: {suggest(name, list(names.values())) if names else 'give its id, or names'}.")
 
 
 def _remove(
@@ -115,18 +116,17 @@ def _remove(
     io.write_image(folder / f"{stem}.png", io.contact_sheet(pictures, columns=2))
 
 
-def _sheet(
-    gaussians: Gaussians, views: io.Views, object_id: np.ndarray, num_ids: int, names: dict[int, str]
-) -> np.ndarray:
+def _sheet(gaussians: Gaussians, views: io.Views, object_id: np.ndarray, names: dict[int, str]) -> np.ndarray:
     """A few photos with the lifted objects laid over them, and the legend below."""
     chosen = np.unique(np.linspace(0, len(views) - 1, _SHEET_VIEWS).astype(int))
-    membership = jax.nn.one_hot(object_id, num_ids)
+    ids = np.unique(np.maximum(object_id, 0))
+    membership = jnp.asarray(object_id[:, None] == ids, gaussians.means.dtype)
     tinted, shown = [], []
     for view in chosen:
         camera = views.cameras[int(view)]
         frame = render(gaussians, camera, outputs=("object_weights",), object_weights=membership)
         assert frame.object_weights is not None
-        shown.append(np.asarray(id_image(frame.object_weights)))
+        shown.append(np.asarray(id_image(frame.object_weights, ids=ids)))
         tinted.append(overlay(views.images[view], shown[-1]))
     sheet = io.contact_sheet(tinted, columns=2)
     every = {number: names.get(number, "") for number in np.unique(object_id).tolist() if number > 0}

@@ -72,22 +72,25 @@ def read_inputs(scene: Scene) -> Inputs:
     if spec.views is not None:
         masks = True if spec.masks is None else scene.path(spec.masks)
         views = io.load_views(scene.path(spec.views), masks=masks, max_size=spec.max_size, origin=spec.origin)
-    known: dict[str, int] = {}
-    if spec.names is not None:
-        known = {str(name): int(number) for number, name in io.read_json(scene.path(spec.names)).items()}
-    ids = {name: _id_of(name, scene, known) for name in scene.objects}
+    names = {} if spec.names is None else io.load_names(scene.path(spec.names))
+    ids = {name: _id_of(name, scene, names) for name in scene.objects}
     _check_ids(ids)
-    return Inputs(gaussians, views, ids, {number: name for name, number in known.items()})
+    return Inputs(gaussians, views, ids, names)
 
 
-def _id_of(name: str, scene: Scene, known: dict[str, int]) -> int:
+def _id_of(name: str, scene: Scene, names: dict[int, str]) -> int:
     own = scene.objects[name].id
     if own is not None:
+        if not 0 <= own < 2**31:
+            raise SceneError(
+                f"objects.{name}.id = {own}: must lie from 0 to 2³¹ - 1; give the object's id in the masks."
+            )
         return own
-    if name not in known:
-        remedy = suggest(name, known) if known else f"give objects.{name}.id, or input.names"
+    found = io.id_named(name, names)
+    if found is None:
+        remedy = suggest(name, list(names.values())) if names else f"give objects.{name}.id, or input.names"
         raise SceneError(f"objects.{name}: no object of that name in {scene.input.names or 'input.names'}; {remedy}.")
-    return known[name]
+    return found
 
 
 def _check_ids(ids: dict[str, int]) -> None:
@@ -110,7 +113,8 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
             raise SceneError("input.views is missing: several objects can be told apart by masks only.")
         (only,) = inputs.ids.values()
         count = len(inputs.gaussians)
-        return Labels(jnp.full(count, only, jnp.int32), jnp.zeros((count, 0), jnp.int32), jnp.ones(count))
+        ids = jnp.asarray([0, only], jnp.int32)
+        return Labels(jnp.full(count, only, jnp.int32), jnp.zeros((count, 2), jnp.int32), jnp.ones(count), ids=ids)
     views = inputs.views.subset("train") if "train" in inputs.views.splits else inputs.views
     assert views.masks is not None
     check_ids_occur(inputs.ids, views.masks)
@@ -118,17 +122,16 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
         inputs.gaussians,
         views.cameras,
         views.masks,
-        num_ids=max(inputs.ids.values(), default=0) + 1,
         fill=spec.fill_unseen,
         tau_T=spec.tau_T,
         tau_d=spec.tau_d,
         background=spec.background,
     )
-    found = np.bincount(np.maximum(labels.object_id, 0), minlength=labels.votes.shape[1])
+    found = np.unique(np.maximum(labels.object_id, 0))
     for name, number in inputs.ids.items():
-        if found[number] == 0:
+        if number not in found:
             raise SceneError(f"objects.{name}: no Gaussian has its id {number} in the masks; check input.masks.")
-    _warn_of_unnamed(inputs, np.flatnonzero(found[1:]) + 1)
+    _warn_of_unnamed(inputs, found[found > 0])
     return labels
 
 

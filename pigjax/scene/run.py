@@ -74,7 +74,7 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress) -> None:
         tell("seed", 0, 1)
         plan = make_plan(scene, inputs, labels)
         labels = plan.labels
-        io.save_labels(out / "labels.npz", labels.object_id, labels.votes, labels.confidence)
+        io.save_labels(out / "labels.npz", labels.object_id, labels.votes, labels.confidence, labels.ids)
     _describe(scene, inputs, plan, labels, report)
     with report.stage("simulate"):
         _simulate(scene, plan, out / "states", key, report, tell)
@@ -221,15 +221,14 @@ def _draw_objects(
 ) -> None:
     """The first frame with its objects tinted, and the legend below."""
     object_id = np.asarray(labels.object_id)
-    occurring = np.unique(np.maximum(object_id, 0))
-    occurring = occurring if occurring[0] == 0 else np.concatenate([[0], occurring])
-    # memory goes by the ids that occur; the unseen, -1, are of none
-    membership = jnp.where(object_id[:, None] < 0, 0.0, object_id[:, None] == occurring)
+    known = np.unique(np.concatenate([[0], np.maximum(object_id, 0)]))
+    # the unseen, -1, are of none
+    membership = jnp.asarray(object_id[:, None] == known, inputs.gaussians.means.dtype)
     frame = render(
         inputs.gaussians, camera, outputs=("object_weights",), object_weights=membership, background=background
     )
     assert frame.object_weights is not None
-    ids = occurring[np.asarray(id_image(frame.object_weights))]
+    ids = id_image(frame.object_weights, ids=known)
     names = {number: name for name, number in inputs.ids.items()}
     tinted = overlay(image, ids)
     legend = legend_sheet(names, image=image, ids=ids, width=tinted.shape[1])

@@ -126,7 +126,7 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     The ranges of a material's numbers are those of its law: see `materials.LIMITS`.
     """
 
-    id: Annotated[int, Limits(0, 65535)] | None = None  # in the masks; None: looked up by the object's name
+    id: Annotated[int, Limits(0, 2**31 - 1)] | None = None  # in the masks; None: looked up by the object's name
     fixed: bool = False  # a still collider made from its own splats
     friction: Annotated[float, _FRICTION] = 0.5  # Coulomb's coefficient of a fixed object
     material: str | None = None

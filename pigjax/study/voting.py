@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -115,8 +115,9 @@ def voting(scene: Scene, *, temperature: float | None = None) -> Voting:
     inputs = read_inputs(scene)
     if inputs.views is None or inputs.views.masks is None:
         raise SceneError("input.views is missing: a study of segmentation needs posed photos with masks.")
-    views, masks = inputs.views, inputs.views.masks
-    check_ids_occur(inputs.ids, masks)
+    check_ids_occur(inputs.ids, inputs.views.masks)
+    masks, number = _compact(inputs.views.masks, inputs.ids.values())
+    views = eqx.tree_at(lambda v: v.masks, inputs.views, masks)
     if {"train", "test"} <= set(views.splits):
         train, held = views.subset("train"), views.subset("test")
         shown, hidden = (train.cameras, train.masks), (held.cameras, held.masks)
@@ -133,6 +134,13 @@ def voting(scene: Scene, *, temperature: float | None = None) -> Voting:
         tau_T=jnp.asarray(scene.segmentation.tau_T),
         tau_d=jnp.asarray(scene.segmentation.tau_d),
         temperature=None if temperature is None else jnp.asarray(temperature),
-        num_ids=max(inputs.ids.values(), default=0) + 1,
+        num_ids=number,
         config=config,
     )
+
+
+def _compact(masks: Int[np.ndarray | Array, "t h w"], ids: Iterable[int]) -> tuple[Int[np.ndarray, "t h w"], int]:
+    """Masks whose ids, and those of the scene, are numbered from 0, and how many there are."""
+    masks = np.asarray(masks)
+    known = np.union1d(np.unique(masks), [0, *ids])
+    return np.searchsorted(known, masks).astype(np.int32), max(len(known), 2)
