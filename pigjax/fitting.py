@@ -42,7 +42,7 @@ class FitConfig(eqx.Module):
     band_every: int = static_field(default=500)  # steps between one SH band and the next
     relocate_every: int = static_field(default=100)  # steps; 0 never moves a splat
     relocate_until: float = static_field(default=0.8)  # share of the steps
-    noise: float = static_field(default=2e3)  # of the centres, times their rate; 0 traces none
+    noise: float = static_field(default=200.0)  # of the centres, times their rate, per squared extent; 0 traces none
     opacity_regularizer: float = static_field(default=0.002)
     scale_regularizer: float = static_field(default=0.002)  # per extent of the points
     evaluate_every: int = static_field(default=500)
@@ -137,7 +137,8 @@ def train_steps(state: FitState, cameras: Camera, photos: Photos, config: FitCon
         gaussians = optax.apply_updates(state.gaussians, updates)
         if config.noise:
             rate = config.means_rate * extent * 0.01 ** (state.step / config.steps)
-            gaussians = shake(gaussians, key, config.noise * rate)
+            # the shake is a covariance times this factor, so that it grows with the scene as its lengths do
+            gaussians = shake(gaussians, key, config.noise * rate / extent**2)
         pose_updates, pose_moments = optimizers[1].update(pose_gradient, state.pose_optimizer, state.poses)
         moved = (optax.apply_updates(state.poses, pose_updates), pose_moments)
         visited = jnp.arange(views) == view

@@ -253,7 +253,9 @@ def bind(gaussians: Gaussians, labels: Any, particles: Particles, *, neighbours:
         _, index = cKDTree(x[carriers]).query(means[loose[mine]], k=np.arange(1, neighbours + 1))
         nearest[mine] = carriers[np.minimum(index, len(carriers) - 1)]
     offsets = means[loose][:, None] - x[nearest]
-    weights = 1 / np.maximum(np.sum(offsets**2, -1), 1e-30)
+    squared = np.sum(np.asarray(offsets, np.float64) ** 2, -1)
+    # a Gaussian at the very place of a particle goes with that one, whatever the scale of the scene
+    weights = 1 / np.maximum(squared, 1e-12 * squared.max(initial=1e-200))
     weights = (weights / weights.sum(1, keepdims=True)).astype(x.dtype)
     return Binding(jnp.asarray(loose), jnp.asarray(nearest), jnp.asarray(weights), jnp.asarray(offsets))
 

@@ -16,6 +16,7 @@ from pigjax.arrays import array_field, einsum, static_field
 from pigjax.bands import collect, spread
 from pigjax.camera import Camera, stack_cameras, to_camera
 from pigjax.errors import InputError
+from pigjax.extent import Extent, scene_extent, typical_distance
 from pigjax.linalg import quat_to_matrix, safe_normalize, svd
 from pigjax.lists import BlendConfig, Projected, count_pairs, slots_of, tile_boxes
 from pigjax.tiles import blend
@@ -74,7 +75,7 @@ class RenderConfig(eqx.Module):
     transmittance_min: float = static_field(default=1e-4)  # a pixel is closed before it falls below
     dilation: float = static_field(default=0.3)  # added to the 2D covariance [px²]
     antialias: bool = static_field(default=False)  # lower the opacity by what the dilation added
-    near: float = static_field(default=0.01)  # [m]
+    near: float | None = static_field(default=None)  # [m]; None: a hundredth of the splats' typical distance
     chunk: int | None = static_field(default=None)  # splats blended between two looks at a tile; None: 64, or 16 if few
     tiles_at_once: int | None = static_field(default=None)  # walked together; None: 1 on a CPU, 2048 elsewhere
     bands: int = static_field(default=1)  # local devices that share the image, each a band of rows
@@ -91,6 +92,7 @@ class RenderConfig(eqx.Module):
 
 OUTPUTS = ("rgb", "alpha", "depth", "surface_depth", "object_weights", "normals", "features")
 _SH_CONSTANT = 0.28209479177387814
+_NEAR = 0.01  # of the splats' typical distance from the camera: 1 cm at 1 m
 _FOV_MARGIN = 0.3  # the projection's linearisation is held at this share of half the image beyond its edge
 
 
@@ -105,6 +107,16 @@ def as_splats(gaussians: Gaussians | Splats) -> Splats:
         return gaussians
     opacities = jax.nn.sigmoid(gaussians.logit_opacities)
     return Splats(gaussians.means, gaussian_factors(gaussians), opacities, gaussians.sh)
+
+
+def extent_of(gaussians: Gaussians) -> Extent:
+    """Middle and size of the dense core of Gaussians, host; see `scene_extent`.
+
+    Raises:
+        InputError: there is no Gaussian with a finite centre.
+    """
+    opacities = np.asarray(jax.nn.sigmoid(gaussians.logit_opacities))
+    return scene_extent(np.asarray(gaussians.means), opacities, np.exp(np.asarray(gaussians.log_scales).max(1)))
 
 
 def render(
@@ -238,9 +250,16 @@ def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: b
         alpha_min=config.alpha_min,
         alpha_max=config.alpha_max,
         transmittance_min=config.transmittance_min,
-        near=config.near,
+        near=config.near or 0.0,  # 0 orders every depth that occurs
         surface=surface,
     )
+
+
+def near_plane(splats: Splats, camera: Camera, config: RenderConfig) -> Float[Array, ""] | float:
+    """Camera z [m] up to which nothing is drawn and nothing votes; it scales with the scene unless the caller set it."""
+    if config.near is not None:
+        return config.near
+    return _NEAR * typical_distance(splats.means, lax.stop_gradient(camera.position))
 
 
 def colours(splats: Splats, camera: Camera, sh_degree: int | None = None) -> Float[Array, "n 3"]:
@@ -298,7 +317,7 @@ def project_splats(splats: Splats, camera: Camera, config: RenderConfig) -> Proj
     fx, fy = camera.focal
     cx, cy = camera.centre
     x, y, depth = to_camera(splats.means, camera).T
-    ahead = depth > config.near
+    ahead = depth > near_plane(splats, camera, config)
     z = jnp.where(ahead, depth, 1.0)
     u, v = x / z, y / z
     margin_x, margin_y = _FOV_MARGIN * camera.width / (2 * fx), _FOV_MARGIN * camera.height / (2 * fy)

@@ -77,7 +77,7 @@ class CameraSpec(Struct, forbid_unknown_fields=True, frozen=True):
 
     view: str | None = None  # name of a photo whose camera is taken
     target: Triple | None = None  # centre of the orbit [m]; None: middle of the moving objects
-    radius: float | None = None  # [m]
+    radius: float | None = None  # [m]; None: twice the median distance of the scene's core from the target
     elevation: float = 30.0  # [degrees]
     start: float = 0.0  # azimuth of the first frame [degrees]
     sweep: float = 0.0  # azimuth covered by the video [degrees]
