@@ -23,7 +23,12 @@ Mask = Bool[Array, "... _ _"] | Num[Array, "... _ _"] | Bool[np.ndarray, "... _ 
 
 
 def psnr(a: Float[Array, "h w *c"], b: Float[Array, "h w *c"]) -> Float[Array, ""]:
-    """Peak signal-to-noise ratio [dB] of images in [0, 1]; inf where they are equal."""
+    """Peak signal-to-noise ratio [dB] of images in [0, 1]; inf where they are equal.
+
+    Raises:
+        InputError: the images differ in shape, or hold integers.
+    """
+    _check_pair(a, b)
     return -10 * jnp.log10(jnp.mean((a - b) ** 2))
 
 
@@ -32,12 +37,26 @@ def ssim(a: Float[Array, "h w *c"], b: Float[Array, "h w *c"]) -> Float[Array, "
     """Structural similarity of images in [0, 1], mean over pixels and channels (Wang et al. 2004).
 
     As in 3DGS: Gaussian window 11x11 with σ = 1.5 px, zeros beyond the edge. Reverse mode only.
+
+    Raises:
+        InputError: the images differ in shape, or hold integers.
     """
+    _check_pair(a, b)
     a, b = (jnp.moveaxis(jnp.atleast_3d(v), -1, 0) for v in (a, b))
     mean_a, mean_b, squares, product = _blur(jnp.stack([a, b, a * a + b * b, a * b]))
     mean_squares, mean_product = mean_a * mean_a + mean_b * mean_b, mean_a * mean_b
     covariance, variances = product - mean_product, squares - mean_squares
     return jnp.mean((2 * mean_product + _C1) * (2 * covariance + _C2) / ((mean_squares + _C1) * (variances + _C2)))
+
+
+def _check_pair(a: Any, b: Any) -> None:
+    if a.shape != b.shape:
+        raise InputError(
+            f"the images have shapes {tuple(a.shape)} and {tuple(b.shape)}: both must be [h, w, channels]."
+        )
+    for image in (a, b):
+        if not jnp.issubdtype(image.dtype, jnp.floating):
+            raise InputError(f"an image holds {image.dtype}: give floats in 0..1 (bytes / 255).")
 
 
 @jax.custom_vjp

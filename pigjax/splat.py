@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from pigjax.arrays import array_field, einsum, static_field
 from pigjax.bands import collect, spread
-from pigjax.camera import Camera, stack_cameras, to_camera
+from pigjax.camera import Camera, require_one, stack_cameras, to_camera
 from pigjax.errors import InputError
 from pigjax.extent import Extent, scene_extent, typical_distance
 from pigjax.linalg import quat_to_matrix, safe_normalize, svd
@@ -144,7 +144,7 @@ def render(
         tau_T: transmittance that marks the surface (paper 3.2); not differentiated through.
 
     Raises:
-        InputError: unknown output, or object weights or features asked for but not given.
+        InputError: unknown output, object weights or features asked for but not given, or a batch of cameras.
     """
     unknown = [name for name in outputs if name not in OUTPUTS]
     if unknown or not outputs:
@@ -155,6 +155,7 @@ def render(
         raise InputError("outputs has 'features': pass features, the channels [n f] of each splat.")
     given = {"object_weights": object_weights, "features": features}
     given = {name: values for name, values in given.items() if name in outputs}
+    require_one(camera, "camera")
     tau_T, background = jnp.asarray(tau_T), jnp.asarray(background)
     return _render(gaussians_or_splats, camera, config, background, tuple(outputs), given, tau_T)
 
@@ -256,7 +257,7 @@ def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: b
 
 
 def near_plane(splats: Splats, camera: Camera, config: RenderConfig) -> Float[Array, ""] | float:
-    """Camera z [m] up to which nothing is drawn and nothing votes; it scales with the scene unless the caller set it."""
+    """Camera z [m] up to which nothing is drawn and nothing votes; it scales with the scene unless set."""
     if config.near is not None:
         return config.near
     return _NEAR * typical_distance(splats.means, lax.stop_gradient(camera.position))
