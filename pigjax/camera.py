@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from pigjax.arguments import checked
 from pigjax.arrays import Vector, array_field, einsum, matmul, static_field
 from pigjax.errors import InputError
 from pigjax.linalg import quat_to_matrix
@@ -71,6 +72,7 @@ class Camera(eqx.Module):
         return Camera(self.world_to_cam, self.focal * factor, self.centre * factor, width, height)
 
 
+@checked
 def look_at(
     eye: Vector,
     target: Vector,
@@ -160,6 +162,7 @@ def unproject(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "h w 3
     return matmul(local - translation, jnp.linalg.inv(rotation).T)
 
 
+@checked
 def orbit(
     target: Vector,
     *,
@@ -214,6 +217,7 @@ def orbit(
     return stack_cameras([look(eye, up=top) for eye, top in zip(eyes, ups)])
 
 
+@checked
 def stack_cameras(cameras: list[Camera]) -> Camera:
     """Batch of single cameras of one size.
 
@@ -238,6 +242,7 @@ def stack_cameras(cameras: list[Camera]) -> Camera:
     )
 
 
+@checked
 def interpolate_path(keys: Camera, frames: int) -> Camera:
     """Batch of `frames` cameras that passes through the key cameras, positions linear and axes re-orthogonalised.
 

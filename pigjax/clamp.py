@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from pigjax.arguments import checked
 from pigjax.arrays import array_field, static_field
 from pigjax.errors import InputError
 from pigjax.linalg import aligned_svd, matmul3, polar, quat_to_matrix, svd
@@ -45,6 +46,7 @@ class ClampParams(eqx.Module):
             raise InputError(f"ClampParams: tau_min = {self.tau_min} exceeds tau_max = {self.tau_max}; exchange them.")
 
 
+@checked
 def eigen_clamp(
     gaussians: Gaussians, F: Float[Array, "n 3 3"], params: ClampParams, *, mode: str = "aligned"
 ) -> Splats:

@@ -1,4 +1,4 @@
-"""The size of a scene, which every length that nobody gave is a share of: cameras, near plane, gaps, tolerances. Leaf."""
+"""The size of a scene: cameras, near plane, gaps and tolerances that nobody gave are shares of it. Leaf."""
 
 from __future__ import annotations
 

@@ -110,6 +110,12 @@ def _band_rates(step: Int[Array, ""], config: FitConfig) -> Float[Array, "k 1"]:
     return jnp.where(step >= band * config.band_every, np.where(band == 0, 1.0, 0.05), 0.0)[:, None]
 
 
+def noise_at(step: Int[Array, ""] | int, config: FitConfig, extent: float) -> Float[Array, ""] | float:
+    """Factor [1/m] on the covariance that shakes a centre: shakes grow with the scene as its lengths do."""
+    rate = config.means_rate * extent * 0.01 ** (step / config.steps)
+    return config.noise * rate / extent**2
+
+
 @eqx.filter_jit
 def train_steps(state: FitState, cameras: Camera, photos: Photos, config: FitConfig, optimizers, extent: float, count):
     """`count` steps: the state after them, and their mean loss."""
@@ -136,9 +142,7 @@ def train_steps(state: FitState, cameras: Camera, photos: Photos, config: FitCon
         updates = eqx.tree_at(lambda g: g.sh, updates, updates.sh * _band_rates(state.step, config))
         gaussians = optax.apply_updates(state.gaussians, updates)
         if config.noise:
-            rate = config.means_rate * extent * 0.01 ** (state.step / config.steps)
-            # the shake is a covariance times this factor, so that it grows with the scene as its lengths do
-            gaussians = shake(gaussians, key, config.noise * rate / extent**2)
+            gaussians = shake(gaussians, key, noise_at(state.step, config, extent))
         pose_updates, pose_moments = optimizers[1].update(pose_gradient, state.pose_optimizer, state.poses)
         moved = (optax.apply_updates(state.poses, pose_updates), pose_moments)
         visited = jnp.arange(views) == view

@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
+from pigjax.arguments import checked
 from pigjax.errors import InputError
 
 _SIGMA = 1.5  # [px]
@@ -22,6 +23,7 @@ _C1, _C2 = 0.01**2, 0.03**2  # for images in [0, 1]
 Mask = Bool[Array, "... _ _"] | Num[Array, "... _ _"] | Bool[np.ndarray, "... _ _"] | Num[np.ndarray, "... _ _"]
 
 
+@checked
 def psnr(a: Float[Array, "h w *c"], b: Float[Array, "h w *c"]) -> Float[Array, ""]:
     """Peak signal-to-noise ratio [dB] of images in [0, 1]; inf where they are equal.
 
@@ -32,6 +34,7 @@ def psnr(a: Float[Array, "h w *c"], b: Float[Array, "h w *c"]) -> Float[Array, "
     return -10 * jnp.log10(jnp.mean((a - b) ** 2))
 
 
+@checked
 @jax.jit
 def ssim(a: Float[Array, "h w *c"], b: Float[Array, "h w *c"]) -> Float[Array, ""]:
     """Structural similarity of images in [0, 1], mean over pixels and channels (Wang et al. 2004).
@@ -92,6 +95,7 @@ def _blur_along(images: Float[Array, "*n h w"], axis: int) -> Float[Array, "*n h
     return reduce(jnp.add, pieces)
 
 
+@checked
 @jax.jit
 def mean_iou(prediction: Mask, truth: Mask) -> Float[Array, ""]:
     """Intersection over union of masks, mean over leading axes; a score of 1 where both masks are empty.
@@ -102,6 +106,7 @@ def mean_iou(prediction: Mask, truth: Mask) -> Float[Array, ""]:
     return jnp.mean(_iou(_resize_nearest(_binary(prediction), *truth.shape[-2:]), truth))
 
 
+@checked
 @partial(jax.jit, static_argnames="dilation_ratio")
 def boundary_iou(prediction: Mask, truth: Mask, dilation_ratio: float = 0.02) -> Float[Array, ""]:
     """`mean_iou` of the masks' boundaries (Cheng et al. 2021, as used by Gaussian Grouping).

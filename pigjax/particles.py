@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
+from pigjax.arguments import checked
 from pigjax.arrays import array_field, einsum
 from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.colliders import Collider
@@ -39,6 +40,7 @@ class Binding(eqx.Module):
         return self.gaussian.shape[0]
 
 
+@checked
 def seed_particles(
     gaussians: Gaussians,
     labels: Any,
@@ -229,6 +231,7 @@ def _most_visible(shell: Shell, own: np.ndarray, cell: np.ndarray, most: int | N
     return np.sort(ranked[rank < most])
 
 
+@checked
 def bind(gaussians: Gaussians, labels: Any, particles: Particles, *, neighbours: int = 4) -> Binding:
     """Carriers for the Gaussians of moving objects that have no particle of their own, host.
 
@@ -260,6 +263,7 @@ def bind(gaussians: Gaussians, labels: Any, particles: Particles, *, neighbours:
     return Binding(jnp.asarray(loose), jnp.asarray(nearest), jnp.asarray(weights), jnp.asarray(offsets))
 
 
+@checked
 def deform(
     gaussians: Gaussians,
     particles: Particles,
@@ -301,6 +305,7 @@ def deform(
     return jax.tree.map(lambda all_, moved: all_.at[index].set(moved, mode="drop"), rest, posed)
 
 
+@checked
 def at_frame(particles: Particles, trajectory: Trajectory, frame: int | Int[Array, ""]) -> Particles:
     """Particles as they are drawn after a frame; the elastic F and C stay as in `particles`."""
     return eqx.tree_at(

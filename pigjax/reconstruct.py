@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from pigjax import io
+from pigjax.arguments import checked
 from pigjax.bands import replicate
 from pigjax.camera import Camera
 from pigjax.errors import InputError
@@ -70,6 +71,7 @@ class Reconstruction:
         return float(np.mean(list(self.ssim.values()))) if self.ssim else float("nan")
 
 
+@checked
 def reconstruct(
     views: io.Views,
     config: FitConfig = FitConfig(),

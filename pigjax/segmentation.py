@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, Integer, Num
 from scipy.spatial import cKDTree
 
+from pigjax.arguments import checked
 from pigjax.arrays import array_field
 from pigjax.camera import Camera
 from pigjax.chunks import static_capacity
@@ -43,6 +44,7 @@ class Labels(eqx.Module):
     overflow: Int[Array, ""] | None = None  # box/tile pairs that the renderer dropped, over all views
 
 
+@checked
 def lift_masks(
     gaussians: Gaussians | Splats,
     cameras: Camera,
@@ -129,6 +131,7 @@ def lift_masks(
     return Labels(object_id, votes, confidence, overflow)
 
 
+@checked
 def object_mask(
     gaussians: Gaussians | Splats,
     labels: Labels,
@@ -161,6 +164,7 @@ def object_mask(
     return draw("object_weights", splats, camera, config, object_weights=member[:, None])[0][..., 0]
 
 
+@checked
 def fill_unseen(gaussians: Gaussians | Splats, labels: Labels, k: int = 8) -> Labels:
     """Give Gaussians that no view saw (id -1) the commonest id among their k nearest seen ones, host.
 

@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from pigjax.arguments import checked
 from pigjax.arrays import array_field, einsum, static_field
 from pigjax.bands import collect, spread
 from pigjax.camera import Camera, require_one, stack_cameras, to_camera
@@ -119,6 +120,7 @@ def extent_of(gaussians: Gaussians) -> Extent:
     return scene_extent(np.asarray(gaussians.means), opacities, np.exp(np.asarray(gaussians.log_scales).max(1)))
 
 
+@checked
 def render(
     gaussians_or_splats: Gaussians | Splats,
     camera: Camera,
@@ -195,6 +197,7 @@ def _render(gaussians_or_splats, camera, config, background, outputs, given, tau
     return Frame(alpha=alpha if "alpha" in outputs else None, overflow=overflow, **planes)
 
 
+@checked
 def surface_depth(
     gaussians: Gaussians | Splats,
     camera: Camera,
@@ -208,6 +211,7 @@ def surface_depth(
     return depth
 
 
+@checked
 def required_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: RenderConfig = RenderConfig()) -> int:
     """Box/tile pairs that the fullest of these cameras has, host. A capacity at least this large never overflows."""
     splats = as_splats(gaussians)

@@ -13,6 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "pigjax"
 # every module may import what stands on a lower floor only
 FLOORS = [
     {"errors", "arrays", "rewind"},
+    {"arguments"},
     {"linalg", "krylov", "metrics", "lists", "extent"},
     {"camera", "materials", "bands", "footprints"},
     {"chunks"},

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from PIL import Image
 
+from pigjax.arguments import checked
 from pigjax.camera import Camera
 from pigjax.errors import InputError, MissingFileError
 from pigjax.io.capture import Capture, Shot
@@ -62,6 +63,7 @@ class Views(eqx.Module):
         return self[_of_split(self.splits, split, "Views")]
 
 
+@checked
 def load_views(
     path: PathLike,
     *,
@@ -133,6 +135,7 @@ def load_views(
     )
 
 
+@checked
 def load_cameras(path: PathLike, *, max_size: int | None = None) -> tuple[Camera, tuple[str, ...]]:
     """Cameras and names as `load_views` gives them, for drawing where there are no photos. Host.
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 from PIL import Image
 
+from pigjax.arguments import checked
 from pigjax.errors import InputError
 from pigjax.io.files import PathLike, existing, writing
 
@@ -17,6 +18,7 @@ Background = float | int | tuple[float, float, float]
 Picture = Float[Array | np.ndarray, "_ _ ..."] | UInt8[Array | np.ndarray, "_ _ ..."]
 
 
+@checked
 def read_image(path: PathLike, *, background: Background = 0.0) -> Float[np.ndarray, "h w 3"]:
     """A picture as RGB in 0..1; a transparent one is composited onto `background`.
 
@@ -60,6 +62,7 @@ def open_rgb(path: PathLike, *, background: Background) -> Image.Image:
     return image.convert("RGB")
 
 
+@checked
 def write_image(path: PathLike, image: Picture) -> None:
     """Write RGB or grey values in 0..1 (or uint8); the suffix picks the format.
 
@@ -81,6 +84,7 @@ def write_image(path: PathLike, image: Picture) -> None:
             raise InputError(f"{path}: {error}; use a suffix such as .png or .jpg.") from None
 
 
+@checked
 def contact_sheet(frames: Iterable[Picture], columns: int = 4, *, gap: int = 4) -> UInt8[np.ndarray, "h w 3"]:
     """Frames of one size side by side in rows of `columns`, on white, `gap` pixels apart.
 

@@ -11,12 +11,14 @@ from jaxtyping import Array, Int, Integer
 from PIL import Image
 from scipy import ndimage
 
+from pigjax.arguments import checked
 from pigjax.errors import InputError, MissingFileError
 from pigjax.io.files import PathLike, existing, existing_folder, read_json, writing
 from pigjax.io.images import open_image
 from pigjax.io.mask_json import Segments, frame_order, paint, read_view, read_views
 
 
+@checked
 def load_masks(
     folder: PathLike,
     names: Sequence[str],
@@ -83,6 +85,7 @@ def load_masks(
     return _merged(masks, merge or {})
 
 
+@checked
 def save_masks(folder: PathLike, names: Sequence[str], masks: Integer[np.ndarray | Array, "t h w"]) -> None:
     """Write `<name>.png`, 8-bit where all ids fit, else 16-bit. Host.
 

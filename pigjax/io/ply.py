@@ -9,6 +9,7 @@ import numpy as np
 import plyfile
 from jaxtyping import Float
 
+from pigjax.arguments import checked
 from pigjax.errors import InputError
 from pigjax.io.colmap import read_points3d
 from pigjax.io.files import PathLike, existing, writing
@@ -17,6 +18,7 @@ from pigjax.splat import Gaussians
 _REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(4))
 
 
+@checked
 def load_ply(path: PathLike, *, drop_invalid: bool = False) -> Gaussians:
     """Gaussians from a PLY file in INRIA's layout (3DGS), SH degree 0 to 3, binary or ASCII. Host.
 
@@ -33,6 +35,7 @@ def load_ply(path: PathLike, *, drop_invalid: bool = False) -> Gaussians:
     return gaussians
 
 
+@checked
 def read_ply(path: PathLike, *, drop_invalid: bool = False) -> tuple[Gaussians, int]:
     """Gaussians as `load_ply` gives them, and how many were dropped. Host.
 
@@ -111,6 +114,7 @@ def read_packed(path: PathLike) -> dict[str, np.ndarray]:
     return {name: np.asarray(values, np.float32) for name, values in fields.items()}
 
 
+@checked
 def save_ply(path: PathLike, gaussians: Gaussians, *, ascii: bool = False) -> None:
     """Write Gaussians in INRIA's PLY layout (3DGS) in float32, with zero normals. Host.
 
@@ -139,6 +143,7 @@ def save_ply(path: PathLike, gaussians: Gaussians, *, ascii: bool = False) -> No
         plyfile.PlyData([element], text=ascii, byte_order="<").write(str(partial))
 
 
+@checked
 def load_points(path: PathLike) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Positions [m] and RGB in 0..1 of a sparse cloud: `.ply`, or COLMAP's `points3D.bin` or `points3D.txt`. Host.
 

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
+from pigjax.arguments import checked
 from pigjax.errors import InputError
 from pigjax.io.files import PathLike, existing, writing
 from pigjax.io.images import Picture, rgb_uint8
@@ -39,6 +40,7 @@ _LONGEST = 65535
 _HELD = 0.01  # share that a GIF's rate may be off without a warning
 
 
+@checked
 def write_video(path: PathLike, frames: Iterable[Picture], *, fps: float | int) -> None:
     """Write frames in 0..1 (or uint8) to `.mp4` (H.264, yuv420p) or to a looping `.gif`. Host.
 
@@ -68,6 +70,7 @@ def write_video(path: PathLike, frames: Iterable[Picture], *, fps: float | int) 
         encode(partial, first, pixels, fps)
 
 
+@checked
 def read_video(path: PathLike) -> Float[np.ndarray, "t h w 3"]:
     """Frames of a video in 0..1. Host.
 

@@ -173,7 +173,7 @@ def _size(gaussians: Gaussians) -> str:
     if len(gaussians) == 0:
         return "nothing"
     extent = extent_of(gaussians)
-    centre = ", ".join(_numbers(*extent.centre, span=extent.radius))
+    centre = ", ".join(_numbers(extent.centre, extent.radius))
     return f"radius {extent.radius:.3g} m around ({centre}) m; {extent.outliers} faint or far ones left out"
 
 
@@ -181,10 +181,10 @@ def _box(points: np.ndarray) -> str:
     if len(points) == 0:
         return "none"
     sides = zip("xyz", points.min(0), points.max(0))
-    return "  ".join("{} {} to {}".format(axis, *_numbers(a, b, span=b - a)) for axis, a, b in sides) + " m"
+    return "  ".join("{} {} to {}".format(axis, *_numbers((a, b), b - a)) for axis, a, b in sides) + " m"
 
 
-def _numbers(*values: float, span: float) -> list[str]:
+def _numbers(values: Any, span: Any) -> list[str]:
     """Values with three digits of what they span, however far from the origin."""
     largest = max(abs(float(value)) for value in values)
     more = math.ceil(math.log10(largest / span)) if 0 < span < largest < math.inf else 0

@@ -14,6 +14,7 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import asdict
 
+from pigjax.arguments import checked
 from pigjax.colliders import Box, Capsule, Collider, Cylinder, Plane, Sphere
 from pigjax.errors import InputError, MissingFileError, SceneError
 from pigjax.materials import PRESETS, Material, Parameters
@@ -251,6 +252,7 @@ _COLLIDERS = {
 }
 
 
+@checked
 def load_scene(path: str | Path, *, accuracy: str | None = None) -> Scene:
     """Read and check a scene file. Host.
 

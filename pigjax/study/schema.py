@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
+from pigjax.arguments import checked
 from pigjax.errors import MissingFileError, SceneError
 from pigjax.scene.schema import Scene, explain, scene_from
 
@@ -138,6 +139,7 @@ def _put(values: dict[str, Any], name: str, value: Any) -> None:
     values[field] = value
 
 
+@checked
 def load_study(path: str | Path, *, method: str | None = None) -> Study:
     """Read and check a study file; `method`, if given, is that of `tune`. Host.
 

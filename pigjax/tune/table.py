@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Shaped
 
+from pigjax.arguments import checked
 from pigjax.errors import InputError, MissingFileError
 from pigjax.io.files import writing
 
@@ -186,6 +187,7 @@ class Table:
         pyarrow.parquet.write_table(pyarrow.table(self._flat()), path)
 
 
+@checked
 def load_table(path: PathLike) -> Table:
     """A table that `Table.save` wrote as `.npz`. Host.
 
