@@ -84,7 +84,7 @@ def fits(value: Any, hint: Any) -> bool:
 
 
 def _is_sequence(value: Any) -> bool:
-    if isinstance(value, str | bytes) or getattr(getattr(value, "dtype", None), "kind", "f") not in "biufcV":
+    if isinstance(value, str | bytes | Mapping) or getattr(getattr(value, "dtype", None), "kind", "f") not in "biufcV":
         return False
     return hasattr(value, "__len__") and hasattr(value, "__getitem__")
 

@@ -85,7 +85,7 @@ def write_image(path: PathLike, image: Picture) -> None:
 
 
 @checked
-def contact_sheet(frames: Iterable[Picture], columns: int = 4, *, gap: int = 4) -> UInt8[np.ndarray, "h w 3"]:
+def contact_sheet(frames: Iterable[Any], columns: int = 4, *, gap: int = 4) -> UInt8[np.ndarray, "h w 3"]:
     """Frames of one size side by side in rows of `columns`, on white, `gap` pixels apart.
 
     Raises:

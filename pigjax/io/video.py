@@ -16,6 +16,7 @@ from contextlib import suppress
 from itertools import chain
 from numbers import Real
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -24,7 +25,7 @@ from PIL import Image
 from pigjax.arguments import checked
 from pigjax.errors import InputError
 from pigjax.io.files import PathLike, existing, writing
-from pigjax.io.images import Picture, rgb_uint8
+from pigjax.io.images import rgb_uint8
 
 _H264 = ["-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
 # Tagged, since players guess the colours of untagged film by its size.
@@ -41,7 +42,7 @@ _HELD = 0.01  # share that a GIF's rate may be off without a warning
 
 
 @checked
-def write_video(path: PathLike, frames: Iterable[Picture], *, fps: float | int) -> None:
+def write_video(path: PathLike, frames: Iterable[Any], *, fps: float | int) -> None:
     """Write frames in 0..1 (or uint8) to `.mp4` (H.264, yuv420p) or to a looping `.gif`. Host.
 
     Frames are taken one at a time, so a generator keeps memory small. H.264 needs even sizes: an odd edge is repeated
@@ -93,7 +94,7 @@ def read_video(path: PathLike) -> Float[np.ndarray, "t h w 3"]:
     return frames[:, header.end() :].reshape(-1, height, width, 3).astype(np.float32) / 255
 
 
-def _checked(frames: Iterable[Picture], path: PathLike) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+def _checked(frames: Iterable[Any], path: PathLike) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """8-bit RGB of every frame, all of one size."""
     shape = getattr(frames, "shape", None)
     if shape is not None and (len(shape) not in (3, 4) or (len(shape) == 3 and shape[-1] == 3)):
