@@ -57,7 +57,7 @@ def scene_extent(
         InputError: there is no point whose centre is finite.
     """
     points = np.asarray(means, np.float64)
-    counted = np.isfinite(points).all(1)
+    counted = np.asarray(np.isfinite(points).all(1))
     if not counted.any():
         raise InputError(f"{name}: {len(points)} centres, none of them finite; there is no scene to measure.")
     if opacities is not None:

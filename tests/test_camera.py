@@ -95,10 +95,11 @@ def test_up_along_the_line_of_sight_gives_a_proper_camera(direction, factor):
             np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
             assert np.linalg.det(rotation) == pytest.approx(1, abs=1e-5)
             np.testing.assert_allclose(rotation[2], direction / np.linalg.norm(direction), atol=1e-6)
-    slope = jax.jacobian(
-        lambda e: look_at(e, e + direction, up=direction, focal=20.0, width=16, height=16).world_to_cam
-    )
-    assert np.isfinite(slope(jnp.asarray(eye))).all()
+
+    def pose(place):
+        return look_at(place, place + direction, up=direction, focal=20.0, width=16, height=16).world_to_cam
+
+    assert np.isfinite(jax.jacobian(pose)(jnp.asarray(eye))).all()
 
 
 def test_an_orbit_goes_on_over_the_pole():
@@ -110,15 +111,18 @@ def test_an_orbit_goes_on_over_the_pole():
         np.testing.assert_allclose(near, pole, atol=1e-3)
 
 
+ONE = (1.0, 2.0, 3.0)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
         (
-            lambda: look_at((1.0, 2.0, 3.0), (1.0, 2.0, 3.0), focal=1.0, width=4, height=4),
+            lambda: look_at(ONE, ONE, focal=1.0, width=4, height=4),
             "eye and target are the same",
         ),
         (
-            lambda: look_at((1.0, 2.0, 3.0), (0.0, 0.0, np.nan), focal=1.0, width=4, height=4),
+            lambda: look_at(ONE, (0.0, 0.0, np.nan), focal=1.0, width=4, height=4),
             "target = .*must be finite",
         ),
         (lambda: look_at((1.0, 0.0), (0.0, 0.0, 0.0), focal=1.0, width=4, height=4), "eye = .*three numbers"),

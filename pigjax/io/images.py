@@ -141,4 +141,4 @@ def to_uint8(values: Any, *, name: str = "image") -> UInt8[np.ndarray, "..."]:
         raise InputError(
             f"{name} holds {values.dtype} from {values.min()} to {values.max()}; give uint8, or floats in 0..1."
         )
-    return (np.clip(np.nan_to_num(values.astype(np.float32)), 0, 1) * 255 + 0.5).astype(np.uint8)
+    return np.asarray((np.clip(np.nan_to_num(values.astype(np.float32)), 0, 1) * 255 + 0.5).astype(np.uint8))

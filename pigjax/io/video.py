@@ -82,7 +82,7 @@ def read_video(path: PathLike) -> Float[np.ndarray, "t h w 3"]:
     import imageio_ffmpeg  # not at the top: it would slow down every import of pigjax
 
     path = existing(path, "video")
-    out = ["-f", "image2pipe", "-c:v", "ppm", "pipe:1"]
+    out = ["-fps_mode", "passthrough", "-f", "image2pipe", "-c:v", "ppm", "pipe:1"]
     command = [imageio_ffmpeg.get_ffmpeg_exe(), *_READ, "-i", f"file:{path}", *out]
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
     header = re.match(rb"P6\s+(\d+)\s+(\d+)\s+255\s", done.stdout)
@@ -141,6 +141,6 @@ def _write_gif(path: Path, first: np.ndarray, rest: Iterator[np.ndarray], fps: f
     more = (Image.fromarray(frame) for frame in rest)
     try:
         Image.fromarray(first).save(path, save_all=True, append_images=more, duration=10 * lasts, loop=0)
-    except struct.error:
+    except (struct.error, OverflowError):
         # Pillow joins equal frames into one that lasts as long as all of them
         raise OSError("a frame that lasts longer than a GIF can say; write .mp4") from None
