@@ -9,10 +9,14 @@ from pathlib import Path
 import jax
 
 
-def use_host_devices(count: int | None = None) -> None:
-    """On a CPU, as many devices (by default one per core); call it before JAX computes anything."""
+def use_host_devices(count: int | None = None) -> int:
+    """On a CPU, as many devices (by default one per core); call it before JAX computes anything. How many there are.
+
+    An accelerator counts as it is, whatever is asked for.
+    """
     if jax.config.jax_platforms in (None, "", "cpu"):
         jax.config.update("jax_num_cpu_devices", count or len(os.sched_getaffinity(0)))
+    return jax.local_device_count()
 
 
 def measure(function, *inputs, repeats=9, seconds=20.0):

@@ -22,7 +22,7 @@ parser.add_argument("--devices", type=int, default=len(os.sched_getaffinity(0)),
 parser.add_argument("--plot", type=Path, help="picture of PSNR and SSIM over time")
 parser.add_argument("--out", type=Path, help="write the Gaussians here (.ply)")
 arguments = parser.parse_args()
-use_host_devices(arguments.devices)
+devices = min(arguments.devices, use_host_devices(arguments.devices))
 print(machine())
 views = load_views(TABLETOP)
 config = FitConfig(
@@ -32,7 +32,7 @@ config = FitConfig(
     sh_degree=arguments.sh_degree,
     background=1.0,
     evaluate_every=arguments.every,
-    render=RenderConfig(bands=arguments.devices),
+    render=RenderConfig(bands=devices),
 )
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int, Integer
 from scipy import sparse
 from scipy.optimize import linear_sum_assignment
 
+from pigjax.arguments import checked
 from pigjax.camera import Camera
 from pigjax.errors import InputError
 from pigjax.sightings import Scalar, check_masks, front_of
@@ -37,6 +38,7 @@ class _View(NamedTuple):
     masks: np.ndarray  # [o]
 
 
+@checked
 def associate_masks(
     gaussians: Gaussians | Splats,
     cameras: Camera,
@@ -100,6 +102,7 @@ def associate_masks(
     return Association(masks, len(weights), _scores(views, numbers, len(splats), len(weights)), shown)
 
 
+@checked
 def compact_ids(
     masks: Integer[Array | np.ndarray, "*t h w"],
 ) -> tuple[Integer[np.ndarray, "*t h w"], Int[np.ndarray, "m"]]:

@@ -6,12 +6,17 @@ from collections.abc import Iterator
 from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from pigjax.arguments import checked
 from pigjax.arrays import Vector, array_field, einsum, matmul, static_field
+from pigjax.errors import InputError
 from pigjax.linalg import quat_to_matrix
+
+_ALONG = 1e-6  # sine of the angle between up and the line of sight below which up says nothing
 
 
 class Camera(eqx.Module):
@@ -74,6 +79,7 @@ class Camera(eqx.Module):
         return Camera(self.world_to_cam, self.focal * factor, self.centre * factor, width, height)
 
 
+@checked
 def look_at(
     eye: Vector,
     target: Vector,
@@ -83,10 +89,32 @@ def look_at(
     width: int,
     height: int,
 ) -> Camera:
-    """Camera at `eye` [m] that looks at `target` [m] with `up` on top and the principal point in the middle."""
-    position, goal, above = (jnp.asarray(v, jnp.result_type(float)) for v in (eye, target, up))
+    """Camera at `eye` that looks at `target` with `up` on top and the principal point in the middle.
+
+    Args:
+        eye: centre of the camera [m].
+        target: point in the middle of the image [m].
+        up: direction that points up in the image, of any length. Along the line of sight it says nothing: then the y
+            axis points up, or z where the line of sight is the y axis.
+        focal: focal length [px].
+        width: image width [px].
+        height: image height [px].
+
+    Raises:
+        InputError: eye and target are one point, up has no length, or a number is not finite or not positive (where
+            the numbers are known, not while tracing).
+    """
+    position, goal, above = (_vector(name, v) for name, v in (("eye", eye), ("target", target), ("up", up)))
+    _require_image("look_at", focal, width, height)
+    if _equal(position, goal):
+        raise InputError(f"look_at: eye and target are the same point {_plain(position)}; move one of them.")
+    if _equal(above, jnp.zeros_like(above)):
+        raise InputError("look_at: up = (0, 0, 0) points nowhere; give a direction such as (0, 0, 1).")
     forward = (goal - position) / jnp.linalg.norm(goal - position)
-    right = jnp.cross(forward, above)
+    right = jnp.cross(forward, above / jnp.linalg.norm(above))
+    y_axis, z_axis = jnp.eye(3, dtype=position.dtype)[1:]
+    other = jnp.cross(forward, jnp.where(jnp.abs(forward[1]) < 0.9, y_axis, z_axis))
+    right = jnp.where(jnp.sum(right**2) > _ALONG**2, right, other)
     right = right / jnp.linalg.norm(right)
     rotation = jnp.stack([right, jnp.cross(forward, right), forward])
     dtype = position.dtype
@@ -95,8 +123,26 @@ def look_at(
     return Camera(world_to_cam, jnp.full(2, focal, dtype), size / 2, width, height)
 
 
+def require_one(camera: Camera, name: str) -> None:
+    """Refuse a batch where one camera is needed.
+
+    Raises:
+        InputError: the camera is a batch.
+    """
+    if (axes := camera.world_to_cam.ndim) != 2:
+        raise InputError(
+            f"{name} is a batch of shape {tuple(camera.world_to_cam.shape[: axes - 2])}, one camera is needed: index it"
+            " (camera[0]), or jax.vmap over it."
+        )
+
+
 def to_camera(points: Float[Array, "*n 3"], camera: Camera) -> Float[Array, "*n 3"]:
-    """World points in the frame of one camera [m]."""
+    """World points in the frame of one camera [m].
+
+    Raises:
+        InputError: the camera is a batch.
+    """
+    require_one(camera, "camera")
     return matmul(points, camera.world_to_cam[:3, :3].T) + camera.world_to_cam[:3, 3]
 
 
@@ -109,7 +155,12 @@ def project(points: Float[Array, "*n 3"], camera: Camera) -> tuple[Float[Array, 
 
 
 def unproject(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "h w 3"]:
-    """World points of the pixel centres at camera depth z [m]."""
+    """World points of the pixel centres at camera depth z [m].
+
+    Raises:
+        InputError: the camera is a batch.
+    """
+    require_one(camera, "camera")
     x = (jnp.arange(camera.width) + 0.5 - camera.centre[0]) / camera.focal[0]
     y = (jnp.arange(camera.height) + 0.5 - camera.centre[1]) / camera.focal[1]
     x, y = jnp.broadcast_arrays(x[None, :], y[:, None])
@@ -118,6 +169,7 @@ def unproject(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "h w 3
     return matmul(local - translation, jnp.linalg.inv(rotation).T)
 
 
+@checked
 def orbit(
     target: Vector,
     *,
@@ -144,20 +196,50 @@ def orbit(
         start: first azimuth, from the x axis (from z where x points up) [rad].
         sweep: angle covered; the last camera stops one step before it so that a full circle loops [rad].
         up: axis that points up.
+
+    Raises:
+        InputError: fewer than one frame, a radius that is not > 0, or what `look_at` refuses.
     """
-    above = np.asarray(up, float) / np.linalg.norm(np.asarray(up, float))
+    if frames < 1:
+        raise InputError(f"orbit: frames = {frames}: a path has at least one camera.")
+    if _known(radius) and not 0 < float(radius) < np.inf:
+        raise InputError(f"orbit: radius = {radius}: must be finite and > 0 m, or the camera sits at its target.")
+    for name, value in (("elevation", elevation), ("start", start), ("sweep", sweep)):
+        if not np.isfinite(value):
+            raise InputError(f"orbit: {name} = {value}: must be finite.")
+    axis = np.asarray(_vector("up", up), float)
+    if not axis.any():
+        raise InputError("orbit: up = (0, 0, 0) points nowhere; give a direction such as (0, 0, 1).")
+    above = axis / np.linalg.norm(axis)
     reference = np.eye(3)[0] if abs(above[0]) < 0.9 else np.eye(3)[2]
     first = reference - above * matmul(reference, above)
     first /= np.linalg.norm(first)
     azimuth = start + sweep * np.arange(frames) / frames
     around = np.cos(azimuth)[:, None] * first + np.sin(azimuth)[:, None] * np.cross(above, first)
     eyes = np.asarray(target) + radius * (np.cos(elevation) * around + np.sin(elevation) * above)
-    look = partial(look_at, target=target, up=above, focal=focal, width=width, height=height)
-    return stack_cameras([look(eye) for eye in eyes])
+    look = partial(look_at, target=target, focal=focal, width=width, height=height)
+    # seen from a pole, the axis is the line of sight; the meridian goes on into what is up there
+    poles = abs(np.cos(elevation)) < _ALONG
+    ups = -np.sign(np.sin(elevation)) * around if poles else np.broadcast_to(above, eyes.shape)
+    return stack_cameras([look(eye, up=top) for eye, top in zip(eyes, ups)])
 
 
+@checked
 def stack_cameras(cameras: list[Camera]) -> Camera:
-    """Batch of single cameras of one size."""
+    """Batch of single cameras of one size.
+
+    Raises:
+        InputError: no cameras, one that is a batch itself, or cameras of different sizes.
+    """
+    if not cameras:
+        raise InputError("stack_cameras: no cameras were given; give at least one.")
+    for index, camera in enumerate(cameras):
+        require_one(camera, f"stack_cameras: cameras[{index}]")
+        if (camera.width, camera.height) != (cameras[0].width, cameras[0].height):
+            raise InputError(
+                f"stack_cameras: cameras[{index}] is {camera.width} x {camera.height} px, the first"
+                f" {cameras[0].width} x {cameras[0].height}; resize them (Camera.resized)."
+            )
     return Camera(
         jnp.stack([c.world_to_cam for c in cameras]),
         jnp.stack([c.focal for c in cameras]),
@@ -167,8 +249,21 @@ def stack_cameras(cameras: list[Camera]) -> Camera:
     )
 
 
+@checked
 def interpolate_path(keys: Camera, frames: int) -> Camera:
-    """Batch of `frames` cameras that passes through the key cameras, positions linear and axes re-orthogonalised."""
+    """Batch of `frames` cameras that passes through the key cameras, positions linear and axes re-orthogonalised.
+
+    Args:
+        keys: batch of one camera or more.
+        frames: number of cameras of the path.
+
+    Raises:
+        InputError: the keys are a single camera, or fewer than one frame is asked for.
+    """
+    if keys.world_to_cam.ndim != 3 or keys.world_to_cam.shape[0] == 0:
+        raise InputError("interpolate_path: keys is no batch of cameras; stack at least one (stack_cameras).")
+    if frames < 1:
+        raise InputError(f"interpolate_path: frames = {frames}: a path has at least one camera.")
     count = len(keys)
     t = jnp.linspace(0.0, count - 1.0, frames)
     low = jnp.clip(jnp.floor(t).astype(int), 0, max(count - 2, 0))
@@ -187,3 +282,36 @@ def interpolate_path(keys: Camera, frames: int) -> Camera:
     world_to_cam = world_to_cam.at[:, :3, :3].set(rotation)
     world_to_cam = world_to_cam.at[:, :3, 3].set(-einsum("fij,fj->fi", rotation, position))
     return Camera(world_to_cam, mix(keys.focal), mix(keys.centre), keys.width, keys.height)
+
+
+def _vector(name: str, value: Vector) -> Float[Array, "3"]:
+    """Three numbers, finite where they are known."""
+    try:
+        vector = jnp.asarray(value, jnp.result_type(float))
+    except (TypeError, ValueError):
+        raise InputError(f"{name} = {value!r}: three numbers are needed.") from None
+    if vector.shape != (3,):
+        raise InputError(f"{name} = {value!r}: three numbers are needed.")
+    if _known(vector) and not np.isfinite(np.asarray(vector)).all():
+        raise InputError(f"{name} = {_plain(vector)}: must be finite.")
+    return vector
+
+
+def _require_image(function: str, focal: float, width: int, height: int) -> None:
+    if _known(focal) and not 0 < float(focal) < np.inf:
+        raise InputError(f"{function}: focal = {focal}: must be finite and > 0 px.")
+    if width < 1 or height < 1:
+        raise InputError(f"{function}: width, height = {width}, {height}: an image has at least one pixel.")
+
+
+def _known(value) -> bool:
+    return not isinstance(value, jax.core.Tracer)
+
+
+def _equal(a, b) -> bool:
+    """Whether two vectors are known to be the same."""
+    return _known(a) and _known(b) and bool(np.array_equal(np.asarray(a), np.asarray(b)))
+
+
+def _plain(vector) -> tuple[float, ...]:
+    return tuple(np.asarray(vector, float).tolist())

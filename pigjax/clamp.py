@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from pigjax.arguments import checked
 from pigjax.arrays import array_field, static_field
 from pigjax.checks import Limits, check_fields, shown
 from pigjax.errors import InputError
@@ -50,6 +51,7 @@ class ClampParams(eqx.Module):
             )
 
 
+@checked
 def eigen_clamp(
     gaussians: Gaussians, F: Float[Array, "n 3 3"], params: ClampParams, *, mode: str = "aligned"
 ) -> Splats:

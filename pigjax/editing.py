@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from pigjax.arguments import checked
 from pigjax.camera import Camera
 from pigjax.errors import InputError
 from pigjax.segmentation import Labels, object_mask
 from pigjax.splat import Gaussians, RenderConfig, as_splats, render
 
 
+@checked
 def extract_object(gaussians: Gaussians, labels: Labels, object_id: int) -> Gaussians:
     """The Gaussians of one object, in their old order. Host.
 
@@ -25,6 +27,7 @@ def extract_object(gaussians: Gaussians, labels: Labels, object_id: int) -> Gaus
     return _chosen(gaussians, _members(labels, object_id))
 
 
+@checked
 def remove_object(gaussians: Gaussians, labels: Labels, object_id: int) -> Gaussians:
     """The scene without one object, in its old order. Host.
 
@@ -34,6 +37,7 @@ def remove_object(gaussians: Gaussians, labels: Labels, object_id: int) -> Gauss
     return _chosen(gaussians, ~_members(labels, object_id))
 
 
+@checked
 @eqx.filter_jit
 def hole_mask(
     gaussians: Gaussians,

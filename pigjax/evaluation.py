@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from pigjax.arguments import checked
 from pigjax.camera import Camera
 from pigjax.errors import InputError
 from pigjax.metrics import MaskScores, mean_iou, score_masks
@@ -28,6 +29,7 @@ class Evaluation(NamedTuple):
     masks: dict[str, dict[tuple[str, str], Bool[np.ndarray, "h w"]]]  # by level, then (view, prompt)
 
 
+@checked
 def evaluate_labels(
     gaussians: Gaussians | Splats,
     labels: Labels,

@@ -54,7 +54,8 @@ class FitConfig(eqx.Module):
     band_every: int = static_field(default=500, limits=Limits(0, LARGEST_WHOLE))
     relocate_every: int = static_field(default=100, limits=Limits(0, LARGEST_WHOLE))  # steps; 0 never moves a splat
     relocate_until: float = static_field(default=0.8, limits=Limits(0, 1))  # share of the steps
-    noise: float = static_field(default=2e3, limits=Limits(0, 1e9))  # of the centres, times their rate; 0 traces none
+    # of the centres, times their rate, per squared extent; 0 traces none
+    noise: float = static_field(default=200.0, limits=Limits(0, 1e9))
     opacity_regularizer: float = static_field(default=0.002, limits=Limits(0, 1e6))
     scale_regularizer: float = static_field(default=0.002, limits=Limits(0, 1e6))  # per extent of the points
     evaluate_every: int = static_field(default=500, limits=Limits(1, LARGEST_WHOLE))
@@ -120,6 +121,12 @@ def _band_rates(step: Int[Array, ""], config: FitConfig) -> Float[Array, "k 1"]:
     return jnp.where(step >= band * config.band_every, np.where(band == 0, 1.0, 0.05), 0.0)[:, None]
 
 
+def noise_at(step: Int[Array, ""] | int, config: FitConfig, extent: float) -> Float[Array, ""] | float:
+    """Factor [1/m] on the covariance that shakes a centre: shakes grow with the scene as its lengths do."""
+    rate = config.means_rate * extent * 0.01 ** (step / config.steps)
+    return config.noise * rate / extent**2
+
+
 @eqx.filter_jit
 def train_steps(state: FitState, cameras: Camera, photos: Photos, config: FitConfig, optimizers, extent: float, count):
     """`count` steps: the state after them, and their mean loss."""
@@ -146,8 +153,7 @@ def train_steps(state: FitState, cameras: Camera, photos: Photos, config: FitCon
         updates = eqx.tree_at(lambda g: g.sh, updates, updates.sh * _band_rates(state.step, config))
         gaussians = optax.apply_updates(state.gaussians, updates)
         if config.noise:
-            rate = config.means_rate * extent * 0.01 ** (state.step / config.steps)
-            gaussians = shake(gaussians, key, config.noise * rate)
+            gaussians = shake(gaussians, key, noise_at(state.step, config, extent))
         pose_updates, pose_moments = optimizers[1].update(pose_gradient, state.pose_optimizer, state.poses)
         moved = (optax.apply_updates(state.poses, pose_updates), pose_moments)
         visited = jnp.arange(views) == view

@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Num
 
+from pigjax.arguments import checked
 from pigjax.errors import InputError
 
 _SIGMA = 1.5  # [px]
@@ -22,22 +23,43 @@ _C1, _C2 = 0.01**2, 0.03**2  # for images in [0, 1]
 Mask = Bool[Array, "... _ _"] | Num[Array, "... _ _"] | Bool[np.ndarray, "... _ _"] | Num[np.ndarray, "... _ _"]
 
 
+@checked
 def psnr(a: Float[Array, "h w *c"], b: Float[Array, "h w *c"]) -> Float[Array, ""]:
-    """Peak signal-to-noise ratio [dB] of images in [0, 1]; inf where they are equal."""
+    """Peak signal-to-noise ratio [dB] of images in [0, 1]; inf where they are equal.
+
+    Raises:
+        InputError: the images differ in shape, or hold integers.
+    """
+    _check_pair(a, b)
     return -10 * jnp.log10(jnp.mean((a - b) ** 2))
 
 
+@checked
 @jax.jit
 def ssim(a: Float[Array, "h w *c"], b: Float[Array, "h w *c"]) -> Float[Array, ""]:
     """Structural similarity of images in [0, 1], mean over pixels and channels (Wang et al. 2004).
 
     As in 3DGS: Gaussian window 11x11 with σ = 1.5 px, zeros beyond the edge. Reverse mode only.
+
+    Raises:
+        InputError: the images differ in shape, or hold integers.
     """
+    _check_pair(a, b)
     a, b = (jnp.moveaxis(jnp.atleast_3d(v), -1, 0) for v in (a, b))
     mean_a, mean_b, squares, product = _blur(jnp.stack([a, b, a * a + b * b, a * b]))
     mean_squares, mean_product = mean_a * mean_a + mean_b * mean_b, mean_a * mean_b
     covariance, variances = product - mean_product, squares - mean_squares
     return jnp.mean((2 * mean_product + _C1) * (2 * covariance + _C2) / ((mean_squares + _C1) * (variances + _C2)))
+
+
+def _check_pair(a: Any, b: Any) -> None:
+    if a.shape != b.shape:
+        raise InputError(
+            f"the images have shapes {tuple(a.shape)} and {tuple(b.shape)}: both must be [h, w, channels]."
+        )
+    for image in (a, b):
+        if not jnp.issubdtype(image.dtype, jnp.floating):
+            raise InputError(f"an image holds {image.dtype}: give floats in 0..1 (bytes / 255).")
 
 
 @jax.custom_vjp
@@ -73,6 +95,7 @@ def _blur_along(images: Float[Array, "*n h w"], axis: int) -> Float[Array, "*n h
     return reduce(jnp.add, pieces)
 
 
+@checked
 @jax.jit
 def mean_iou(prediction: Mask, truth: Mask) -> Float[Array, ""]:
     """Intersection over union of masks, mean over leading axes; a score of 1 where both masks are empty.
@@ -83,6 +106,7 @@ def mean_iou(prediction: Mask, truth: Mask) -> Float[Array, ""]:
     return jnp.mean(_iou(_resize_nearest(_binary(prediction), *truth.shape[-2:]), truth))
 
 
+@checked
 @partial(jax.jit, static_argnames="dilation_ratio")
 def boundary_iou(prediction: Mask, truth: Mask, dilation_ratio: float = 0.02) -> Float[Array, ""]:
     """`mean_iou` of the masks' boundaries (Cheng et al. 2021, as used by Gaussian Grouping).

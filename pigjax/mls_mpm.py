@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from pigjax.arguments import checked
 from pigjax.boxes import run_in_boxes, run_in_one_box
 from pigjax.colliders import Collider
 from pigjax.contact import BodyContact
@@ -29,6 +30,7 @@ _COST_OF_IMPLICIT = 400  # explicit steps in the time of an implicit one, by ben
 Vector = Float[Array, "3"] | Sequence[float | int] | np.ndarray
 
 
+@checked
 def stable_dt(
     table: MaterialTable,
     grid: Grid,
@@ -49,6 +51,7 @@ def stable_dt(
     return cfl * jnp.minimum(advective, viscous)
 
 
+@checked
 def choose_integrator(
     particles: Particles, grid: Grid, table: MaterialTable, config: SimConfig, **steps: Any
 ) -> SimConfig:
@@ -63,6 +66,7 @@ def choose_integrator(
     return implicit if needed[0] > _COST_OF_IMPLICIT * needed[1] else explicit
 
 
+@checked
 def choose_substeps(
     particles: Particles,
     grid: Grid,
@@ -92,6 +96,7 @@ def choose_substeps(
     return max(-(-needed // unit) * unit, 1)
 
 
+@checked
 def step(
     particles: Particles,
     grid: Grid,
@@ -118,6 +123,7 @@ def step(
     return end, health
 
 
+@checked
 def rollout(
     particles: Particles,
     grid: Grid,

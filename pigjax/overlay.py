@@ -69,9 +69,11 @@ def overlay(
         outline: draw each object's inner edge in its full colour.
 
     Raises:
-        InputError: the picture and the ids differ in size.
+        InputError: the picture is not [h w 3], or the ids differ from it in size.
     """
     image, ids = np.asarray(image), np.asarray(ids)
+    if image.ndim != 3 or image.shape[-1] != 3:
+        raise InputError(f"image has shape {image.shape}: it must be [height, width, 3].")
     if image.shape[:2] != ids.shape:
         raise InputError(f"ids have size {ids.shape}, the image {image.shape[:2]}: both must be [height, width].")
     base = _bytes(image).astype(float)
@@ -177,5 +179,5 @@ def _edges(ids: np.ndarray) -> np.ndarray:
 
 def _bytes(image: np.ndarray) -> np.ndarray:
     if np.issubdtype(image.dtype, np.integer):
-        return image.astype(np.uint8)
-    return np.round(255 * np.clip(image, 0.0, 1.0)).astype(np.uint8)
+        return np.clip(image, 0, 255).astype(np.uint8)
+    return np.round(255 * np.clip(np.nan_to_num(image), 0.0, 1.0)).astype(np.uint8)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
+from pigjax.arguments import checked
 from pigjax.arrays import array_field, einsum
 from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.colliders import Collider
@@ -39,6 +40,7 @@ class Binding(eqx.Module):
         return self.gaussian.shape[0]
 
 
+@checked
 def seed_particles(
     gaussians: Gaussians,
     labels: Any,
@@ -229,6 +231,7 @@ def _most_visible(shell: Shell, own: np.ndarray, cell: np.ndarray, most: int | N
     return np.sort(ranked[rank < most])
 
 
+@checked
 def bind(gaussians: Gaussians, labels: Any, particles: Particles, *, neighbours: int = 4) -> Binding:
     """Carriers for the Gaussians of moving objects that have no particle of their own, host.
 
@@ -253,11 +256,14 @@ def bind(gaussians: Gaussians, labels: Any, particles: Particles, *, neighbours:
         _, index = cKDTree(x[carriers]).query(means[loose[mine]], k=np.arange(1, neighbours + 1))
         nearest[mine] = carriers[np.minimum(index, len(carriers) - 1)]
     offsets = means[loose][:, None] - x[nearest]
-    weights = 1 / np.maximum(np.sum(offsets**2, -1), 1e-30)
+    squared = np.sum(np.asarray(offsets, np.float64) ** 2, -1)
+    # a Gaussian at the very place of a particle goes with that one, whatever the scale of the scene
+    weights = 1 / np.maximum(squared, 1e-12 * squared.max(initial=1e-200))
     weights = (weights / weights.sum(1, keepdims=True)).astype(x.dtype)
     return Binding(jnp.asarray(loose), jnp.asarray(nearest), jnp.asarray(weights), jnp.asarray(offsets))
 
 
+@checked
 def deform(
     gaussians: Gaussians,
     particles: Particles,
@@ -299,6 +305,7 @@ def deform(
     return jax.tree.map(lambda all_, moved: all_.at[index].set(moved, mode="drop"), rest, posed)
 
 
+@checked
 def at_frame(particles: Particles, trajectory: Trajectory, frame: int | Int[Array, ""]) -> Particles:
     """Particles as they are drawn after a frame; the elastic F and C stay as in `particles`.
 

@@ -10,11 +10,13 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from pigjax import io
+from pigjax.arguments import checked
 from pigjax.camera import Camera, stack_cameras
 from pigjax.errors import InputError
 from pigjax.splat import Gaussians, RenderConfig, render
 
 
+@checked
 @eqx.filter_jit
 def contributions(
     gaussians: Gaussians,
@@ -35,6 +37,7 @@ def contributions(
     return lax.scan(of_view, jnp.zeros(len(gaussians), gaussians.means.dtype), cameras)[0]
 
 
+@checked
 def prune(
     gaussians: Gaussians,
     views: io.Views | Camera,

@@ -16,9 +16,11 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from pigjax import io
+from pigjax.arguments import checked
 from pigjax.bands import replicate
 from pigjax.camera import Camera
 from pigjax.errors import InputError
+from pigjax.extent import scene_extent
 from pigjax.fitting import (
     FitConfig,
     FitState,
@@ -69,6 +71,7 @@ class Reconstruction:
         return float(np.mean(list(self.ssim.values()))) if self.ssim else float("nan")
 
 
+@checked
 def reconstruct(
     views: io.Views,
     config: FitConfig = FitConfig(),
@@ -99,7 +102,7 @@ def reconstruct(
     held_out = views.subset("test") if "test" in views.splits else None
     if points is None:
         points = random_points(train.cameras, min(config.splats, 5000), seed=config.seed)
-    extent = float(np.linalg.norm(np.std(points[0], axis=0))) or 1.0
+    extent = scene_extent(points[0], name="points").spread
     pose_rate = optax.exponential_decay(config.pose_rate, config.steps, 0.1)
     optimizers = optimizer_of(config, extent), optax.adam(pose_rate)
     bands = bands_of(train.cameras, config.render)

@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, Integer, Num
 from scipy.spatial import cKDTree
 
+from pigjax.arguments import checked
 from pigjax.arrays import array_field
 from pigjax.camera import Camera
 from pigjax.chunks import static_capacity
@@ -45,6 +46,7 @@ class Labels(eqx.Module):
     ids: Int[Array, "m"] | None = None  # id of each column of `votes`; None: column k counts id k
 
 
+@checked
 def lift_masks(
     gaussians: Gaussians | Splats,
     cameras: Camera,
@@ -132,6 +134,7 @@ def lift_masks(
     return Labels(object_id, votes, confidence, overflow)
 
 
+@checked
 def object_mask(
     gaussians: Gaussians | Splats,
     labels: Labels,
@@ -164,6 +167,7 @@ def object_mask(
     return draw("object_weights", splats, camera, config, object_weights=member[:, None])[0][..., 0]
 
 
+@checked
 def fill_unseen(gaussians: Gaussians | Splats, labels: Labels, k: int = 8) -> Labels:
     """Give Gaussians that no view saw (id -1) the commonest id among their k nearest seen ones, host.
 

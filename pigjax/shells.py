@@ -92,7 +92,8 @@ def _connected(means: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"]) -
     if count == 1:
         return np.ones(1, bool), float(radii[0])
     distances, neighbours = cKDTree(means).query(means, k=min(7, count))
-    typical = float(np.median(distances[:, -1]))
+    # where most centres coincide, the splats themselves say how large a gap is
+    typical = float(np.median(distances[:, -1])) or float(np.median(radii))
     reach = np.minimum(radii, 4 * typical)
     linked = distances <= np.maximum(4 * typical, 2 * (reach[:, None] + reach[neighbours]))
     rows = np.repeat(np.arange(count), neighbours.shape[1])[linked.ravel()]
@@ -102,7 +103,7 @@ def _connected(means: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"]) -
     large = sizes >= max(2, 0.01 * count)
     large[np.argmax(sizes)] = True
     # the 6th of randomly scattered neighbours on a surface of n points per m² is 1.38/√n away
-    return large[component], max(0.72 * typical, 1e-12 * float(np.abs(means).max()) + 1e-30)
+    return large[component], max(0.72 * typical, 1e-12 * float(np.abs(means).max()))
 
 
 def solid_of(shell: Shell, *, max_cells: int = 64) -> Solid:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.camera import Camera, project
 from pigjax.errors import InputError
-from pigjax.splat import RenderConfig, Splats, render
+from pigjax.splat import RenderConfig, Splats, near_plane, render
 
 Scalar = Float[Array, ""] | float
 
@@ -36,7 +36,7 @@ def pixel_under(
     """Flat index of the pixel that each centre falls in, the centre's camera z [m], and whether it is in view."""
     position, z = project(splats.means, camera)
     size = jnp.array([camera.width, camera.height], position.dtype)
-    inside = (z > config.near) & jnp.all((position >= 0) & (position < size), 1)
+    inside = (z > near_plane(splats, camera, config)) & jnp.all((position >= 0) & (position < size), 1)
     column, row = jnp.where(inside[:, None], position, 0.0).astype(jnp.int32).T
     return row * camera.width + column, z, inside
 

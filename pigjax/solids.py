@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from pigjax.arguments import checked
 from pigjax.arrays import Vector
 from pigjax.colliders import SampledDistance
 from pigjax.errors import InputError
@@ -20,6 +21,7 @@ _MARGIN = 3  # samples of the distance around the object
 _DEPTH = 16  # samples below it: an open surface carries that deep
 
 
+@checked
 def collider_from_gaussians(
     gaussians: Gaussians,
     *,

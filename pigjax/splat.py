@@ -12,11 +12,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from pigjax.arguments import checked
 from pigjax.arrays import array_field, einsum, static_field
 from pigjax.bands import collect, spread
-from pigjax.camera import Camera, stack_cameras, to_camera
+from pigjax.camera import Camera, require_one, stack_cameras, to_camera
 from pigjax.checks import LARGEST_WHOLE, Limits, check_fields
 from pigjax.errors import InputError
+from pigjax.extent import Extent, scene_extent, typical_distance
 from pigjax.linalg import quat_to_matrix, safe_normalize, svd
 from pigjax.lists import BlendConfig, Projected, count_pairs, slots_of, tile_boxes
 from pigjax.tiles import blend
@@ -83,7 +85,8 @@ class RenderConfig(eqx.Module):
     transmittance_min: float = static_field(default=1e-4, limits=Limits(0, 1, below=True))
     dilation: float = static_field(default=0.3, limits=Limits(0, 1e6, unit="px²"))  # added to the 2D covariance
     antialias: bool = static_field(default=False)  # lower the opacity by what the dilation added
-    near: float = static_field(default=0.01, limits=Limits(0.0, 1e9, unit="m"))
+    # None: a hundredth of the splats' typical distance
+    near: float | None = static_field(default=None, limits=Limits(0.0, 1e9, unit="m"))
     # splats blended between two looks at a tile; None: 64, or 16 if few
     chunk: int | None = static_field(default=None, limits=Limits(1, 1_000_000))
     # walked together; None: 1 on a CPU, 2048 elsewhere
@@ -104,6 +107,7 @@ class RenderConfig(eqx.Module):
 
 OUTPUTS = ("rgb", "alpha", "depth", "surface_depth", "object_weights", "normals", "features")
 _SH_CONSTANT = 0.28209479177387814
+_NEAR = 0.01  # of the splats' typical distance from the camera: 1 cm at 1 m
 _FOV_MARGIN = 0.3  # the projection's linearisation is held at this share of half the image beyond its edge
 
 
@@ -120,6 +124,17 @@ def as_splats(gaussians: Gaussians | Splats) -> Splats:
     return Splats(gaussians.means, gaussian_factors(gaussians), opacities, gaussians.sh)
 
 
+def extent_of(gaussians: Gaussians) -> Extent:
+    """Middle and size of the dense core of Gaussians, host; see `scene_extent`.
+
+    Raises:
+        InputError: there is no Gaussian with a finite centre.
+    """
+    opacities = np.asarray(jax.nn.sigmoid(gaussians.logit_opacities))
+    return scene_extent(np.asarray(gaussians.means), opacities, np.exp(np.asarray(gaussians.log_scales).max(1)))
+
+
+@checked
 def render(
     gaussians_or_splats: Gaussians | Splats,
     camera: Camera,
@@ -145,7 +160,7 @@ def render(
         tau_T: transmittance that marks the surface (paper 3.2); not differentiated through.
 
     Raises:
-        InputError: unknown output, or object weights or features asked for but not given.
+        InputError: unknown output, object weights or features asked for but not given, or a batch of cameras.
     """
     unknown = [name for name in outputs if name not in OUTPUTS]
     if unknown or not outputs:
@@ -156,6 +171,7 @@ def render(
         raise InputError("outputs has 'features': pass features, the channels [n f] of each splat.")
     given = {"object_weights": object_weights, "features": features}
     given = {name: values for name, values in given.items() if name in outputs}
+    require_one(camera, "camera")
     tau_T, background = jnp.asarray(tau_T), jnp.asarray(background)
     return _render(gaussians_or_splats, camera, config, background, tuple(outputs), given, tau_T)
 
@@ -195,6 +211,7 @@ def _render(gaussians_or_splats, camera, config, background, outputs, given, tau
     return Frame(alpha=alpha if "alpha" in outputs else None, overflow=overflow, **planes)
 
 
+@checked
 def surface_depth(
     gaussians: Gaussians | Splats,
     camera: Camera,
@@ -208,6 +225,7 @@ def surface_depth(
     return depth
 
 
+@checked
 def required_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: RenderConfig = RenderConfig()) -> int:
     """Box/tile pairs that the fullest of these cameras has, host. A capacity at least this large never overflows."""
     splats = as_splats(gaussians)
@@ -251,9 +269,16 @@ def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: b
         alpha_min=config.alpha_min,
         alpha_max=config.alpha_max,
         transmittance_min=config.transmittance_min,
-        near=config.near,
+        near=config.near or 0.0,  # 0 orders every depth that occurs
         surface=surface,
     )
+
+
+def near_plane(splats: Splats, camera: Camera, config: RenderConfig) -> Float[Array, ""] | float:
+    """Camera z [m] up to which nothing is drawn and nothing votes; it scales with the scene unless set."""
+    if config.near is not None:
+        return config.near
+    return _NEAR * typical_distance(splats.means, lax.stop_gradient(camera.position))
 
 
 def colours(splats: Splats, camera: Camera, sh_degree: int | None = None) -> Float[Array, "n 3"]:
@@ -311,7 +336,7 @@ def project_splats(splats: Splats, camera: Camera, config: RenderConfig) -> Proj
     fx, fy = camera.focal
     cx, cy = camera.centre
     x, y, depth = to_camera(splats.means, camera).T
-    ahead = depth > config.near
+    ahead = depth > near_plane(splats, camera, config)
     z = jnp.where(ahead, depth, 1.0)
     u, v = x / z, y / z
     margin_x, margin_y = _FOV_MARGIN * camera.width / (2 * fx), _FOV_MARGIN * camera.height / (2 * fy)

@@ -38,6 +38,7 @@ def dense_render(
     eye = -np.linalg.solve(view[:3, :3], view[:3, 3])
     d = means - eye
     colour = sh_colour(sh, d / np.linalg.norm(d, axis=1, keepdims=True))
+    near = 0.01 * np.exp(np.log(np.linalg.norm(d, axis=1)).mean()) if config.near is None else config.near
     px, py = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     transmittance = np.ones((height, width))
     closed = np.zeros((height, width), bool)
@@ -46,7 +47,7 @@ def dense_render(
     objects = None if weights is None else np.zeros((height, width, weights.shape[1]))
     for i in np.argsort(local[:, 2], kind="stable"):
         t = local[i]
-        if t[2] <= config.near:
+        if t[2] <= near:
             continue
         limit = [
             ((-centre[k] / focal[k] - 0.15 * s / focal[k]), ((s - centre[k]) / focal[k] + 0.15 * s / focal[k]))

@@ -13,8 +13,8 @@ PACKAGE = Path(__file__).parents[1] / "pigjax"
 # every module may import what stands on a lower floor only
 FLOORS = [
     {"errors", "arrays", "rewind"},
-    {"checks"},
-    {"linalg", "krylov", "metrics", "lists"},
+    {"checks", "arguments"},
+    {"linalg", "krylov", "metrics", "lists", "extent"},
     {"camera", "materials", "bands", "footprints"},
     {"chunks"},
     {"tiles", "colliders", "transfers", "contact"},

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pigjax.camera import Camera, interpolate_path, look_at, orbit, project, unproject
+from pigjax.camera import Camera, interpolate_path, look_at, orbit, project, stack_cameras, unproject
+from pigjax.errors import InputError
 
 
 def test_look_at_puts_the_target_in_the_middle_and_up_on_top():
@@ -81,3 +82,70 @@ def test_length_of_a_single_camera_is_a_clear_error():
     camera = look_at((2.0, 0.0, 0.5), (0.0, 0.0, 0.0), focal=100.0, width=64, height=48)
     with pytest.raises(TypeError, match="single camera"):
         len(camera)
+
+
+@pytest.mark.parametrize("direction", [*np.eye(3), *-np.eye(3), np.ones(3)])
+@pytest.mark.parametrize("factor", [1.0, -1.0, 1e-3])
+def test_up_along_the_line_of_sight_gives_a_proper_camera(direction, factor):
+    eye = np.array([0.5, -2.0, 1.0])
+    make = jax.jit(lambda up: look_at(eye, eye + direction, up=up, focal=20.0, width=16, height=16))
+    for up in (factor * direction, factor * direction + 1e-9):
+        for camera in (make(jnp.asarray(up)), look_at(eye, eye + direction, up=up, focal=20.0, width=16, height=16)):
+            rotation = np.asarray(camera.world_to_cam)[:3, :3]
+            np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
+            assert np.linalg.det(rotation) == pytest.approx(1, abs=1e-5)
+            np.testing.assert_allclose(rotation[2], direction / np.linalg.norm(direction), atol=1e-6)
+
+    def pose(place):
+        return look_at(place, place + direction, up=direction, focal=20.0, width=16, height=16).world_to_cam
+
+    assert np.isfinite(jax.jacobian(pose)(jnp.asarray(eye))).all()
+
+
+def test_an_orbit_goes_on_over_the_pole():
+    common = {"radius": 2.0, "frames": 4, "focal": 20.0, "width": 16, "height": 16}
+    for sign in (1, -1):
+        near, pole = (
+            orbit((0.0, 0.0, 0.0), elevation=sign * angle, **common).world_to_cam for angle in (1.5707, np.pi / 2)
+        )
+        np.testing.assert_allclose(near, pole, atol=1e-3)
+
+
+ONE = (1.0, 2.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: look_at(ONE, ONE, focal=1.0, width=4, height=4),
+            "eye and target are the same",
+        ),
+        (
+            lambda: look_at(ONE, (0.0, 0.0, np.nan), focal=1.0, width=4, height=4),
+            "target = .*must be finite",
+        ),
+        (lambda: look_at((1.0, 0.0), (0.0, 0.0, 0.0), focal=1.0, width=4, height=4), "eye = .*three numbers"),
+        (lambda: look_at((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), up=(0.0, 0.0, 0.0), focal=1.0, width=4, height=4), "up = "),
+        (lambda: look_at((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), focal=-1.0, width=4, height=4), "focal = -1"),
+        (lambda: look_at((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), focal=1.0, width=0, height=4), "at least one pixel"),
+        (lambda: ring(radius=0.0), "radius = 0.0"),
+        (lambda: ring(radius=np.nan), "radius = nan"),
+        (lambda: ring(frames=0), "frames = 0"),
+        (lambda: ring(elevation=np.inf), "elevation = inf"),
+        (lambda: ring(up=(0.0, 0.0, 0.0)), "up = "),
+        (lambda: stack_cameras([]), "no cameras were given"),
+        (lambda: stack_cameras([ring()]), r"cameras\[0\] is a batch"),
+        (lambda: stack_cameras([ring()[0], ring()[0].resized(2, 2)]), r"cameras\[1\] is 2 x 2 px, the first 4 x 4"),
+        (lambda: interpolate_path(ring()[0], 3), "keys is no batch"),
+        (lambda: interpolate_path(ring(), 0), "frames = 0"),
+    ],
+)
+def test_cameras_that_cannot_be_are_refused(call, message):
+    with pytest.raises(InputError, match=message):
+        call()
+
+
+def ring(**changes):
+    settings = {"radius": 1.0, "elevation": 0.3, "frames": 3, "focal": 4.0, "width": 4, "height": 4}
+    return orbit((0.0, 0.0, 0.0), **settings | changes)

@@ -1,5 +1,7 @@
 """Films and pictures read back by ffmpeg and Pillow hold what was written."""
 
+import warnings
+
 import imageio.v3 as imageio
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from PIL import Image
 
 from pigjax.errors import InputError, MissingFileError
-from pigjax.io import contact_sheet, read_image, write_image, write_video
+from pigjax.io import contact_sheet, read_image, read_video, write_image, write_video
 
 
 def colour_frames(height, width, count=6):
@@ -59,7 +61,7 @@ def test_jax_uint8_and_grey_frames_are_films(tmp_path):
         ("a.mp4", [np.zeros((2, 2, 3)), np.zeros((2, 4, 3))], 10, r"frame 1 is \(2, 4\), the first \(2, 2\)"),
         ("a.mp4", [np.zeros((2, 2, 4))], 10, r"has shape \(2, 2, 4\)"),
         ("a.mp4", np.zeros((1, 2, 70000, 3)), 10, r"a\.mp4: cannot be written \(ffmpeg: .*"),
-        ("file/a.mp4", np.zeros((1, 2, 2, 3)), 10, r"file/a\.mp4: cannot be written"),
+        ("file/a.mp4", np.zeros((1, 2, 2, 3)), 10, r"file is a file, where a folder is needed"),
     ],
 )
 def test_bad_films_are_named(tmp_path, name, frames, fps, message):
@@ -110,3 +112,80 @@ def test_bad_contact_sheets_are_named():
         contact_sheet([])
     with pytest.raises(InputError, match=r"frame 1 is \(2, 3\), the first \(2, 2\)"):
         contact_sheet([np.zeros((2, 2, 3)), np.zeros((2, 3, 3))])
+
+
+@pytest.mark.parametrize("folder", ["2026-11-29T22:30:00", "run:1", "http:", "-v", "a b%03d", "[x]", "-i;-y"])
+def test_any_name_of_a_folder_is_a_path_and_no_option_or_protocol(tmp_path, monkeypatch, folder):
+    monkeypatch.chdir(tmp_path)
+    path = f"{folder}/-y:0.mp4"
+    write_video(path, colour_frames(4, 4, 2), fps=10)
+    assert read_video(path).shape == (2, 4, 4, 3)
+    write_video(f"{folder}/a.gif", colour_frames(4, 4, 2), fps=10)
+    assert read_video(f"{folder}/a.gif").shape == (2, 4, 4, 3)
+    assert [entry.name for entry in tmp_path.iterdir()] == [folder]
+
+
+def test_a_playlist_that_names_other_files_is_no_film(tmp_path):
+    write_video(tmp_path / "a.mp4", colour_frames(4, 4, 2), fps=10)
+    inner = (tmp_path / "a.mp4").as_posix()
+    (tmp_path / "b.mp4").write_text(f"ffconcat version 1.0\nfile '{inner}'\n")
+    (tmp_path / "c.mp4").write_text(f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{inner}\n#EXT-X-ENDLIST\n")
+    for name in ("b.mp4", "c.mp4"):
+        with pytest.raises(InputError, match="not a video that ffmpeg reads"):
+            read_video(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("fps", "lasts"), [(60, 20), (35, 30), (24, 40), (25, 40), (50, 20), (100, 20), (240, 20), (10, 100), (1 / 3, 3000)]
+)
+def test_gif_times_are_rounded_to_hundredths_and_a_rate_that_is_not_held_is_said(tmp_path, fps, lasts):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        write_video(tmp_path / "a.gif", colour_frames(5, 7, 3), fps=fps)
+    with Image.open(tmp_path / "a.gif") as film:
+        assert film.info["duration"] == lasts
+    held = abs(1000 / lasts / fps - 1) < 0.01
+    assert held != any("whole hundredths" in str(warning.message) for warning in caught)
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (None, "frames is None"),
+        ("text", "frames is the string"),
+        ({"a": 1}, "frames is a dict"),
+        (np.zeros((4, 5, 3)), r"frames has shape \(4, 5, 3\)"),
+        (np.zeros((2, 2, 4, 5, 3)), r"frames has shape \(2, 2, 4, 5, 3\)"),
+        ([None], "frame 0 is a NoneType that holds no numbers"),
+        (["text"], "frame 0 is a str that holds no numbers"),
+        ([np.zeros(5)], r"frame 0 has shape \(5,\)"),
+        ([[[0.0, 1.0], [0.5]]], "frame 0 is ragged"),
+        ([np.zeros((4, 4, 3)), object()], "frame 1 is a object"),
+        ([np.zeros((0, 4, 3))], "no pixels"),
+        ([np.full((4, 4, 3), 200)], "frame 0 holds int64 from 200 to 200"),
+        ([np.zeros((4, 4, 3), complex)], "holds no numbers"),
+    ],
+)
+@pytest.mark.parametrize("name", ["a.mp4", "a.gif"])
+def test_what_is_no_picture_is_named(tmp_path, name, frames, message):
+    with pytest.raises(InputError, match=message):
+        write_video(tmp_path / name, frames, fps=5)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("fps", [np.nan, np.inf, -1.0, 0.0])
+def test_a_rate_that_is_none_is_refused(tmp_path, fps):
+    with pytest.raises(InputError, match=r"fps = .*must be > 0"):
+        write_video(tmp_path / "a.mp4", colour_frames(4, 4, 2), fps=fps)
+    with pytest.raises(InputError, match=r"655\.35 s at most"):
+        write_video(tmp_path / "a.gif", colour_frames(4, 4, 2), fps=1e-4)
+    with pytest.raises(InputError, match=r"longer than a GIF can say"):
+        write_video(tmp_path / "a.gif", np.zeros((3, 4, 4, 3)), fps=2e-3)
+
+
+def test_nan_is_black_and_booleans_are_white(tmp_path):
+    frames = [np.full((4, 4, 3), np.nan), np.ones((4, 4), bool)]
+    write_video(tmp_path / "a.mp4", frames, fps=5)
+    found = read_video(tmp_path / "a.mp4")
+    assert found[0].max() < 0.02
+    assert found[1].min() > 0.98

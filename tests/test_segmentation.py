@@ -19,7 +19,7 @@ from pigjax.splat import Gaussians, RenderConfig, render
 
 ROOT = Path(__file__).parent.parent
 NUM_IDS, WIDTH, HEIGHT = 5, 40, 28
-CONFIG = RenderConfig()
+CONFIG = RenderConfig(near=0.01)
 
 
 def make_scene(count=80, seed=0, views=5):

@@ -12,6 +12,7 @@ from pigjax.association import compact_ids
 from pigjax.camera import Camera, look_at, stack_cameras
 from pigjax.errors import InputError
 from pigjax.segmentation import Labels, fill_unseen, lift_masks
+from pigjax.splat import RenderConfig
 
 SIZE = 16
 COLUMNS, ROWS = (axis.ravel() for axis in np.meshgrid(np.arange(SIZE), np.arange(SIZE)))
@@ -160,7 +161,9 @@ def test_a_camera_inside_an_object_sees_it_from_within():
     ahead = (z > 0) & (np.abs(x) < z / 2) & (np.abs(y) < z / 2)
     assert voters(labels) == np.flatnonzero(ahead).tolist()
     # closer than the near plane nothing is drawn, and nothing votes at any tolerance
-    assert voters(lift(on_axis([0.005, 1.0]), facing_camera(), ONES, num_ids=3, tau_d=1.0)) == [1]
+    assert voters(
+        lift(on_axis([0.005, 1.0]), facing_camera(), ONES, num_ids=3, tau_d=1.0, config=RenderConfig(near=0.01))
+    ) == [1]
 
 
 def test_ids_far_apart_work_as_they_are_and_compact():

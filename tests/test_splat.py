@@ -268,7 +268,7 @@ DEGENERATE = {
 def degenerate_loss(camera, *inputs):
     def loss(means, scales, quats, opacities, sh):
         splats = splat_module.Splats(means, splat_module.quat_to_matrix(quats) * scales[:, None], opacities, sh)
-        frame = render(splats, camera)
+        frame = render(splats, camera, RenderConfig(near=0.01))
         return jnp.sum(frame.rgb**2), frame
 
     (_, frame), gradients = jax.value_and_grad(loss, argnums=tuple(range(5)), has_aux=True)(*inputs)
@@ -288,7 +288,7 @@ def test_degenerate_splats_draw_right_and_have_finite_gradients(case):
     inputs = [jnp.asarray(scene[k], jnp.float32) for k in ("means", "scales", "quats", "opacities", "sh")]
     frame, gradients = degenerate_loss(camera, *inputs)
     if case != "zero quaternion":
-        rgb, *_ = dense(scene, camera, RenderConfig())
+        rgb, *_ = dense(scene, camera, RenderConfig(near=0.01))
         assert np.abs(frame.rgb - rgb).max() < 2e-4, case
     assert all(np.isfinite(g).all() for g in gradients)
 
@@ -310,7 +310,7 @@ def splats_loss():
     """Loss over splats and camera without thresholds, compiled once in float64, and its gradient."""
     with jax.enable_x64(True):
         weights = jnp.asarray(np.random.default_rng(2).normal(size=(12, 20, 4)))
-        config = RenderConfig(alpha_min=1e-14, alpha_max=1.0, transmittance_min=0.0)
+        config = RenderConfig(alpha_min=1e-14, alpha_max=1.0, transmittance_min=0.0, near=0.01)
 
         def loss(inputs):
             means, scales, quats, opacities, sh, camera = inputs

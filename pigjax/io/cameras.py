@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from PIL import Image
 
+from pigjax.arguments import checked
 from pigjax.camera import Camera
 from pigjax.errors import InputError, MissingFileError
 from pigjax.io.capture import Capture, Shot, check_positions, name_views, one_split_each
@@ -65,6 +66,7 @@ class Views(eqx.Module):
         return self[_of_split(self.splits, split, "Views")]
 
 
+@checked
 def load_views(
     path: PathLike,
     *,
@@ -148,6 +150,7 @@ def load_views(
     )
 
 
+@checked
 def load_cameras(
     path: PathLike, *, max_size: int | None = None, origin: Origin | None = None
 ) -> tuple[Camera, tuple[str, ...]]:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 
+from pigjax.arguments import checked
 from pigjax.camera import Camera
 from pigjax.errors import InputError
 from pigjax.io.cameras import Views, load_cameras, load_views
@@ -42,6 +43,7 @@ class _Truths(NamedTuple):
     names: dict[int, str]  # of the ids in `object_mask`
 
 
+@checked
 def load_dataset(
     path: PathLike,
     layout: str,

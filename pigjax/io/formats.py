@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pigjax.arguments import checked
 from pigjax.errors import InputError
 from pigjax.io.files import PathLike, decoding, existing
 from pigjax.io.origin import Origin, fits_float32, proper_origin
@@ -15,6 +16,7 @@ _SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4),
 _SH_CONSTANT = 0.28209479177387814
 
 
+@checked
 def load_gaussians(path: PathLike, *, drop_invalid: bool = False, origin: Origin | None = None) -> Gaussians:
     """Gaussians from `.ply` (INRIA's layout or PlayCanvas' compressed one), `.splat` or `.spz`. Host.
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 from PIL import Image, ImageOps
 
+from pigjax.arguments import checked
 from pigjax.errors import InputError
 from pigjax.io.files import PathLike, decoding, existing, writing
 
@@ -22,6 +23,7 @@ Background = float | int | tuple[float, float, float]
 Picture = Float[Array | np.ndarray, "_ _ ..."] | UInt8[Array | np.ndarray, "_ _ ..."]
 
 
+@checked
 def read_image(path: PathLike, *, background: Background = 0.0) -> Float[np.ndarray, "h w 3"]:
     """A picture as RGB in 0..1; a transparent one is composited onto `background`.
 
@@ -132,13 +134,21 @@ def _wrong_size(path: PathLike, stored: tuple[int, ...], size: tuple[int, int], 
     )
 
 
+@checked
 def write_image(path: PathLike, image: Picture) -> None:
     """Write RGB or grey values in 0..1 (or uint8); the suffix picks the format.
 
+    Args:
+        path: of the file.
+        image: [h w 3], [h w 4] or [h w].
+
     Raises:
-        InputError: the suffix names no picture format, or the file cannot be written.
+        InputError: what is no picture, the suffix names no picture format, or the file cannot be written.
     """
-    pixels = Image.fromarray(to_uint8(image))
+    values = to_uint8(image, name=f"{path}: image")
+    if not (values.ndim == 2 or (values.ndim == 3 and values.shape[-1] in (3, 4))):
+        raise InputError(f"{path}: image has shape {values.shape}; give [h, w, 3] or [h, w].")
+    pixels = Image.fromarray(values)
     with writing(path) as partial:
         try:
             pixels.save(partial)
@@ -146,13 +156,14 @@ def write_image(path: PathLike, image: Picture) -> None:
             raise InputError(f"{path}: {error}; use a suffix such as .png or .jpg.") from None
 
 
-def contact_sheet(frames: Iterable[Picture], columns: int = 4, *, gap: int = 4) -> UInt8[np.ndarray, "h w 3"]:
+@checked
+def contact_sheet(frames: Iterable[Any], columns: int = 4, *, gap: int = 4) -> UInt8[np.ndarray, "h w 3"]:
     """Frames of one size side by side in rows of `columns`, on white, `gap` pixels apart.
 
     Raises:
         InputError: there are no frames, or they differ in size.
     """
-    tiles = [rgb_uint8(frame) for frame in frames]
+    tiles = [rgb_uint8(frame, name=f"contact_sheet: frame {index}") for index, frame in enumerate(frames)]
     if not tiles:
         raise InputError("contact_sheet: no frames were given; give at least one.")
     height, width, _ = tiles[0].shape
@@ -167,23 +178,39 @@ def contact_sheet(frames: Iterable[Picture], columns: int = 4, *, gap: int = 4) 
     return sheet
 
 
-def rgb_uint8(image: Any) -> UInt8[np.ndarray, "h w 3"]:
+def rgb_uint8(image: Any, *, name: str = "image") -> UInt8[np.ndarray, "h w 3"]:
     """8-bit RGB of one picture in RGB or grey.
 
     Raises:
-        InputError: the array is not [h, w, 3] or [h, w].
+        InputError: the array `name` is not [h, w, 3] or [h, w], or holds no numbers of a picture.
     """
-    pixels = to_uint8(image)
+    pixels = to_uint8(image, name=name)
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[..., None], 3, axis=-1)
     if pixels.ndim != 3 or pixels.shape[-1] != 3:
-        raise InputError(f"image: has shape {pixels.shape}; give [h, w, 3] or [h, w].")
+        raise InputError(f"{name} has shape {pixels.shape}; give [h, w, 3] or [h, w].")
     return pixels
 
 
-def to_uint8(values: Any) -> UInt8[np.ndarray, "..."]:
-    """0..1 to 0..255, rounded and clipped, NaN black; uint8 is left alone."""
-    values = np.asarray(values)
+def to_uint8(values: Any, *, name: str = "image") -> UInt8[np.ndarray, "..."]:
+    """0..1 to 0..255, rounded and clipped, NaN black; uint8 is left alone.
+
+    Raises:
+        InputError: the array `name` holds no pixels, or neither numbers in 0..1 nor bytes.
+    """
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        raise InputError(f"{name} is ragged: its rows differ in length; give [h, w, 3] or [h, w].") from None
+    if array.dtype.kind not in "biuf":
+        raise InputError(f"{name} is a {type(values).__name__} that holds no numbers; give [h, w, 3] or [h, w].")
+    if array.size == 0:
+        raise InputError(f"{name} has shape {array.shape}, no pixels at all; give [h, w, 3] or [h, w].")
+    values = array
     if values.dtype == np.uint8:
         return values
-    return (np.clip(np.nan_to_num(values.astype(np.float32)), 0, 1) * 255 + 0.5).astype(np.uint8)
+    if values.dtype.kind in "iu" and (values.min() < 0 or values.max() > 1):
+        raise InputError(
+            f"{name} holds {values.dtype} from {values.min()} to {values.max()}; give uint8, or floats in 0..1."
+        )
+    return np.asarray((np.clip(np.nan_to_num(values.astype(np.float32)), 0, 1) * 255 + 0.5).astype(np.uint8))

@@ -71,7 +71,7 @@ def load_labels(path: PathLike, count: int | None = None) -> StoredLabels:
         if error.__cause__ is None:
             raise
         raise InputError(f"{path}: not the {_WHAT} ({error.__cause__}); {_REMEDY}.") from error
-    labels = StoredLabels(*(arrays.get(name) for name in StoredLabels._fields))
+    labels = StoredLabels(arrays["object_id"], arrays["votes"], arrays["confidence"], arrays.get("ids"))
     lowest, highest = int(labels.object_id.min(initial=0)), int(labels.object_id.max(initial=0))
     if not -1 <= lowest <= highest < 2**31:
         raise InputError(f"{path}: object_id reaches from {lowest} to {highest}, not from -1 to 2³¹ - 1; {_REMEDY}.")

@@ -12,6 +12,7 @@ from jaxtyping import Array, Int, Integer
 from PIL import Image
 from scipy import ndimage
 
+from pigjax.arguments import checked
 from pigjax.errors import InputError, MissingFileError
 from pigjax.io.files import PathLike, decoding, existing, existing_folder, read_json, writing
 from pigjax.io.images import open_image
@@ -20,6 +21,7 @@ from pigjax.io.mask_json import ID_LIMIT, Segments, frame_order, paint, read_vie
 _LONGEST = 8192  # [px] of a mask's side, where its view is small
 
 
+@checked
 def load_masks(
     folder: PathLike,
     names: Sequence[str],
@@ -94,6 +96,7 @@ def load_masks(
     return _merged(masks, merge or {})
 
 
+@checked
 def save_masks(folder: PathLike, names: Sequence[str], masks: Integer[np.ndarray | Array, "t h w"]) -> None:
     """Write `<name>.png`, 8-bit where all ids fit, else 16-bit. Host.
 

@@ -11,6 +11,7 @@ import numpy as np
 import plyfile
 from jaxtyping import Float
 
+from pigjax.arguments import checked
 from pigjax.errors import InputError
 from pigjax.io.colmap import read_points3d
 from pigjax.io.files import PathLike, existing, writing
@@ -33,6 +34,7 @@ _REMEDY = (
 )
 
 
+@checked
 def load_ply(path: PathLike, *, drop_invalid: bool = False, origin: Origin | None = None) -> Gaussians:
     """Gaussians from a PLY file in INRIA's layout (3DGS), SH degree 0 to 3, binary or ASCII. Host.
 
@@ -57,6 +59,7 @@ def load_ply(path: PathLike, *, drop_invalid: bool = False, origin: Origin | Non
     return gaussians
 
 
+@checked
 def read_ply(path: PathLike, *, drop_invalid: bool = False, origin: Origin | None = None) -> tuple[Gaussians, int]:
     """Gaussians as `load_ply` gives them, and how many were dropped. Host.
 
@@ -205,6 +208,7 @@ def warn_of_dropped(path: PathLike, dropped: int) -> None:
         warnings.warn(f"{path}: dropped {dropped} splats with NaN, inf or a zero quaternion.", stacklevel=3)
 
 
+@checked
 def save_ply(path: PathLike, gaussians: Gaussians, *, ascii: bool = False, origin: Origin | None = None) -> None:
     """Write Gaussians in INRIA's PLY layout (3DGS) in float32, with zero normals. Host.
 
@@ -240,6 +244,7 @@ def save_ply(path: PathLike, gaussians: Gaussians, *, ascii: bool = False, origi
         plyfile.PlyData([element], text=ascii, byte_order="<").write(str(partial))
 
 
+@checked
 def load_points(
     path: PathLike, *, origin: Origin | None = None
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:

@@ -195,7 +195,8 @@ def _feed(hasher: Any, value: Any, seen: dict[int, Any]) -> None:
     if isinstance(value, Mapping):
         put("mapping", len(value))
         for key in sorted(value, key=repr):
-            feed(key), feed(value[key])
+            feed(key)
+            feed(value[key])
     elif isinstance(value, (list, tuple, set, frozenset)):
         put(type(value).__qualname__, len(value))
         for entry in sorted(value, key=repr) if isinstance(value, (set, frozenset)) else value:
@@ -220,7 +221,8 @@ def _feed(hasher: Any, value: Any, seen: dict[int, Any]) -> None:
             for name, own in sorted(vars(value).items()):
                 own = getattr(own, "__func__", getattr(own, "fget", own))
                 if isinstance(own, types.FunctionType):
-                    put(name), feed(own)
+                    put(name)
+                    feed(own)
     else:
         feed(type(value))
         if isinstance(value, msgspec.Struct):
@@ -248,7 +250,8 @@ def _feed_function(function: types.FunctionType, put: Any, feed: Any) -> None:
     feed(code)
     for name in sorted(_names_of(code)):
         if name in function.__globals__:
-            put(name), feed(function.__globals__[name])
+            put(name)
+            feed(function.__globals__[name])
 
 
 def _names_of(code: types.CodeType) -> set[str]:

@@ -1,21 +1,31 @@
-"""Frames to a film."""
+"""Frames to a film.
+
+ffmpeg is given every path as `file:<path>`, so that no name is taken for an option, a protocol or a host. Of a file it
+reads films only: a playlist, which could name other files and hosts, is refused.
+"""
 
 from __future__ import annotations
 
+import math
 import re
+import struct
 import subprocess
-from collections.abc import Iterable, Iterator
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from itertools import chain
+from numbers import Real
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
+from pigjax.arguments import checked
 from pigjax.errors import InputError
 from pigjax.io.files import PathLike, existing, writing
-from pigjax.io.images import Picture, rgb_uint8
+from pigjax.io.images import rgb_uint8
 
 _H264 = ["-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
 # Tagged, since players guess the colours of untagged film by its size.
@@ -23,21 +33,36 @@ _BT709 = ["-vf", "scale=out_color_matrix=bt709:out_range=tv"]
 _BT709 += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"]
 
 
-def write_video(path: PathLike, frames: Iterable[Picture], *, fps: float | int) -> None:
+# Containers that hold their own frames; playlists and scripts (hls, concat, ...) name other files.
+_CONTAINERS = "mov,mp4,matroska,webm,avi,gif,mpegts,mpeg,ogg,flv,asf"
+_READ = ["-nostdin", "-v", "error", "-protocol_whitelist", "file", "-format_whitelist", _CONTAINERS]
+_SHORTEST = 2  # hundredths of a second of a GIF's frame: browsers show shorter ones for ten
+_LONGEST = 65535
+_HELD = 0.01  # share that a GIF's rate may be off without a warning
+
+
+@checked
+def write_video(path: PathLike, frames: Iterable[Any], *, fps: float | int) -> None:
     """Write frames in 0..1 (or uint8) to `.mp4` (H.264, yuv420p) or to a looping `.gif`. Host.
 
     Frames are taken one at a time, so a generator keeps memory small. H.264 needs even sizes: an odd edge is repeated
-    once. GIF times are whole hundredths of a second.
+    once. The frames of a GIF last whole hundredths of a second, two at least since browsers show shorter ones slowly:
+    1 / fps is rounded to that, and a warning says so where the rate is off by more than 1 %.
+
+    Args:
+        path: `.mp4` or `.gif`, in any folder; missing folders are made.
+        frames: pictures [h w 3] or [h w], or arrays [t h w 3] or [t h w] of them.
+        fps: frames a second.
 
     Raises:
-        InputError: unknown suffix, fps not positive, no frames, frames of different sizes, or the file cannot be
-            written.
+        InputError: unknown suffix, fps not finite and positive, no frames, what is no picture, frames of different
+            sizes, or the file cannot be written.
     """
     encode = {".mp4": _write_mp4, ".gif": _write_gif}.get(Path(path).suffix.lower())
     if encode is None:
         raise InputError(f"{path}: unknown video suffix {Path(path).suffix!r}; use .mp4 or .gif.")
-    if not fps > 0:
-        raise InputError(f"{path}: fps = {fps}; it must be > 0.")
+    if isinstance(fps, bool) or not isinstance(fps, Real) or not 0 < fps < math.inf:
+        raise InputError(f"{path}: fps = {fps!r}; it must be > 0, and finite.")
     pixels = _checked(frames, path)
     first = next(pixels, None)
     if first is None:
@@ -46,6 +71,7 @@ def write_video(path: PathLike, frames: Iterable[Picture], *, fps: float | int) 
         encode(partial, first, pixels, fps)
 
 
+@checked
 def read_video(path: PathLike) -> Float[np.ndarray, "t h w 3"]:
     """Frames of a video in 0..1. Host.
 
@@ -56,8 +82,9 @@ def read_video(path: PathLike) -> Float[np.ndarray, "t h w 3"]:
     import imageio_ffmpeg  # not at the top: it would slow down every import of pigjax
 
     path = existing(path, "video")
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", path, "-f", "image2pipe", "-c:v", "ppm", "-"]
-    done = subprocess.run(command, capture_output=True, check=False)
+    out = ["-fps_mode", "passthrough", "-f", "image2pipe", "-c:v", "ppm", "pipe:1"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), *_READ, "-i", f"file:{path}", *out]
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
     header = re.match(rb"P6\s+(\d+)\s+(\d+)\s+255\s", done.stdout)
     if done.returncode or header is None:
         said = done.stderr.decode(errors="replace").strip().splitlines()
@@ -67,11 +94,16 @@ def read_video(path: PathLike) -> Float[np.ndarray, "t h w 3"]:
     return frames[:, header.end() :].reshape(-1, height, width, 3).astype(np.float32) / 255
 
 
-def _checked(frames: Iterable[Picture], path: PathLike) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+def _checked(frames: Iterable[Any], path: PathLike) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """8-bit RGB of every frame, all of one size."""
+    shape = getattr(frames, "shape", None)
+    if shape is not None and (len(shape) not in (3, 4) or (len(shape) == 3 and shape[-1] == 3)):
+        raise InputError(f"{path}: frames has shape {tuple(shape)}; give pictures in a list, or [t, h, w, 3].")
+    if isinstance(frames, str | bytes | Mapping) or (not isinstance(frames, Iterable) and shape is None):
+        raise InputError(f"{path}: frames is a {type(frames).__name__}; give pictures [h, w, 3] in a list.")
     size = None
     for index, frame in enumerate(frames):
-        pixels = rgb_uint8(frame)
+        pixels = rgb_uint8(frame, name=f"{path}: frame {index}")
         size = size or pixels.shape
         if pixels.shape != size:
             raise InputError(f"{path}: frame {index} is {pixels.shape[:2]}, the first {size[:2]} [h w].")
@@ -83,8 +115,8 @@ def _write_mp4(path: Path, first: np.ndarray, rest: Iterator[np.ndarray], fps: f
 
     even = ((0, first.shape[0] % 2), (0, first.shape[1] % 2), (0, 0))
     height, width = (extent + pad for extent, (_, pad) in zip(first.shape, even[:2]))
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps}", "-i", "-"]
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *_BT709, *_H264, str(path)]
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps}", "-i", "pipe:0"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *_BT709, *_H264, f"file:{path}"]
     # Not imageio's own writer: that forks, of which JAX warns, and leaves ffmpeg running where a frame fails.
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
         assert ffmpeg.stdin is not None
@@ -97,5 +129,18 @@ def _write_mp4(path: Path, first: np.ndarray, rest: Iterator[np.ndarray], fps: f
 
 
 def _write_gif(path: Path, first: np.ndarray, rest: Iterator[np.ndarray], fps: float | int) -> None:
+    lasts = max(round(100 / fps), _SHORTEST)
+    if lasts > _LONGEST:
+        raise InputError(f"{path.name}: fps = {fps}: a frame of a GIF lasts 655.35 s at most; write .mp4.")
+    if abs(100 / lasts - fps) > _HELD * fps:
+        warnings.warn(
+            f"a GIF's frames last whole hundredths of a second, {_SHORTEST} at least: fps = {fps:g} is shown as"
+            f" {100 / lasts:.4g}; write .mp4 to keep the rate.",
+            stacklevel=3,
+        )
     more = (Image.fromarray(frame) for frame in rest)
-    Image.fromarray(first).save(path, save_all=True, append_images=more, duration=1000 / fps, loop=0)
+    try:
+        Image.fromarray(first).save(path, save_all=True, append_images=more, duration=10 * lasts, loop=0)
+    except (struct.error, OverflowError):
+        # Pillow joins equal frames into one that lasts as long as all of them
+        raise OSError("a frame that lasts longer than a GIF can say; write .mp4") from None

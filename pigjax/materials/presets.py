@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from pigjax.arguments import checked
 from pigjax.errors import InputError
 from pigjax.materials.table import Material
 
@@ -99,6 +100,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
+@checked
 def preset(name: str) -> Material:
     """The material of that name, one of `PRESETS`.
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from pigjax.arguments import checked
 from pigjax.arrays import as_array, as_float, static_field
 from pigjax.checks import Limits, is_numeric, shown
 from pigjax.errors import InputError
@@ -177,6 +178,7 @@ class MaterialTable(Parameters):
         return jnp.where(np.array([other == law for other in self.laws]), values, 0.0)
 
 
+@checked
 def material_table(materials: Sequence[Material]) -> MaterialTable:
     """Table with one row for each material, in their order.
 

@@ -11,6 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from pigjax.arguments import checked
 from pigjax.arrays import array_field, static_field
 from pigjax.errors import InputError
 from pigjax.materials import MaterialTable
@@ -85,6 +86,7 @@ class Trajectory(eqx.Module):
     F_visual: Float[Array, "t p 3 3"]
 
 
+@checked
 def make_particles(
     x: Float[Array, "p 3"] | np.ndarray,
     *,
@@ -145,6 +147,7 @@ def make_particles(
     )
 
 
+@checked
 def fit_grid(x: Float[Array, "p 3"] | np.ndarray, dx: float, *, margin: float = 0.0) -> Grid:
     """Grid around the particles with `margin` [m] of room inside its walls (host).
 
@@ -176,6 +179,7 @@ def fit_grid(x: Float[Array, "p 3"] | np.ndarray, dx: float, *, margin: float = 
     return Grid(jnp.asarray(low * dx, float), jnp.asarray(dx, float), (nx, ny, nz))
 
 
+@checked
 def vast_grid(dx: float) -> Grid:
     """A domain of a million cells a side around the world's origin, for matter that no wall holds.
 

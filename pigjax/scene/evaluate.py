@@ -66,7 +66,7 @@ def evaluate_files(
         lifted = _lift(gaussians, dataset, fill=fill, **settings)
     else:
         stored = io.load_labels(labels, len(gaussians))
-        lifted = Labels(*(None if array is None else jnp.asarray(array) for array in stored))
+        lifted = Labels(*map(jnp.asarray, stored[:3]), ids=None if stored.ids is None else jnp.asarray(stored.ids))
         lifted = fill_unseen(gaussians, lifted) if fill else lifted
     progress("lift", 1, 1)
     cameras = {view: dataset.test.cameras[i] for i, view in enumerate(dataset.test.names)}

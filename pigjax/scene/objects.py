@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from pigjax.pruning import contributions
 from pigjax.scene.lifting import lift
 from pigjax.scene.schema import load_scene
 from pigjax.segmentation import Labels
-from pigjax.splat import Gaussians, render, sh_degree_of
+from pigjax.splat import Gaussians, extent_of, render, sh_degree_of
 
 _SHEET_VIEWS = 4
 _LEAST_SEEN = 1.0  # pixels over all views; a Gaussian with less of them is a guess of the reconstruction
@@ -175,11 +176,29 @@ def _describe_gaussians(read: tuple[Gaussians, int]) -> dict[str, str]:
         "Gaussians": f"{len(gaussians)}" + (f" ({dropped} invalid ones left out)" if dropped else ""),
         "SH degree": str(sh_degree_of(gaussians)),
         "centres": _box(np.asarray(gaussians.means)),
+        "size": _size(gaussians),
         "scale": f"median {np.median(scales):.3g} m, largest {scales.max():.3g} m",
         "opacity": f"median {np.median(opacities):.2f}, {np.mean(opacities < 1 / 255):.0%} below 1/255",
     }
 
 
+def _size(gaussians: Gaussians) -> str:
+    if len(gaussians) == 0:
+        return "nothing"
+    extent = extent_of(gaussians)
+    centre = ", ".join(_numbers(extent.centre, extent.radius))
+    return f"radius {extent.radius:.3g} m around ({centre}) m; {extent.outliers} faint or far ones left out"
+
+
 def _box(points: np.ndarray) -> str:
-    low, high = points.min(0), points.max(0)
-    return "  ".join(f"{axis} {a:.3g} to {b:.3g}" for axis, a, b in zip("xyz", low, high)) + " m"
+    if len(points) == 0:
+        return "none"
+    sides = zip("xyz", points.min(0), points.max(0))
+    return "  ".join("{} {} to {}".format(axis, *_numbers((a, b), b - a)) for axis, a, b in sides) + " m"
+
+
+def _numbers(values: Any, span: Any) -> list[str]:
+    """Values with three digits of what they span, however far from the origin."""
+    largest = max(abs(float(value)) for value in values)
+    more = math.ceil(math.log10(largest / span)) if 0 < span < largest < math.inf else 0
+    return [f"{value:.{min(3 + more, 15)}g}" for value in values]

@@ -29,7 +29,7 @@ from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec
 from pigjax.segmentation import Labels
 from pigjax.sleep import Sleep
 from pigjax.solids import collider_from_gaussians
-from pigjax.splat import Gaussians, RenderConfig
+from pigjax.splat import Gaussians, RenderConfig, extent_of
 
 
 @dataclass
@@ -273,8 +273,7 @@ def make_cameras(scene: Scene, inputs: Inputs, focus: Float[np.ndarray, "3"]) ->
         return stack_cameras([_camera_of_view(spec, inputs).resized(width, height)] * frames)
     target = np.array(spec.target) if spec.target is not None else focus
     focal = width / (2 * np.tan(np.radians(spec.field_of_view) / 2))
-    means = np.asarray(inputs.gaussians.means)
-    radius = spec.radius if spec.radius is not None else 2.0 * float(np.median(np.linalg.norm(means - target, axis=1)))
+    radius = spec.radius if spec.radius is not None else _default_radius(inputs.gaussians, target)
     return orbit(
         target,
         radius=radius,
@@ -287,6 +286,13 @@ def make_cameras(scene: Scene, inputs: Inputs, focus: Float[np.ndarray, "3"]) ->
         sweep=np.radians(spec.sweep),
         up=axis_of(scene.input.up),
     )
+
+
+def _default_radius(gaussians: Gaussians, target: Float[np.ndarray, "3"]) -> float:
+    """Twice the median distance from the target [m] of the scene's dense core, and never within it."""
+    extent = extent_of(gaussians)
+    distances = np.linalg.norm(np.asarray(gaussians.means, np.float64)[extent.core] - target, axis=1)
+    return max(2.0 * float(np.median(distances)), extent.radius)
 
 
 def render_config(scene: Scene) -> RenderConfig:

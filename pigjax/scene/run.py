@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pigjax import io
+from pigjax.arguments import checked
 from pigjax.boxes import Fit, devices_for
 from pigjax.camera import Camera
 from pigjax.errors import SimulationError
@@ -33,6 +34,7 @@ _FILES = ("video.mp4", "contact_sheet.png", "objects.png", "labels.npz", "report
 Progress = Callable[[str, int, int], None]  # stage, done, of
 
 
+@checked
 def run_scene(scene: Scene, out_dir: str | os.PathLike[str], *, progress: Progress | None = None) -> RunReport:
     """Simulate a scene and draw its video. Host.
 

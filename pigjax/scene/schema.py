@@ -11,6 +11,7 @@ from msgspec import field
 from msgspec.structs import asdict, replace
 
 from pigjax import io
+from pigjax.arguments import checked
 from pigjax.checks import LARGEST_WHOLE, Limits, joined, shown, suggest
 from pigjax.colliders import Box, Capsule, Collider, Cylinder, Plane, Sphere
 from pigjax.errors import InputError, MissingFileError, SceneError
@@ -95,7 +96,7 @@ class CameraSpec(Section, frozen=True):
 
     view: str | None = None  # name of a photo whose camera is taken
     target: Annotated[Triple, _PLACE] | None = None  # centre of the orbit; None: middle of the moving objects
-    radius: Annotated[float, _LENGTH] | None = None
+    radius: Annotated[float, _LENGTH] | None = None  # None: twice the median distance of the scene's core
     elevation: Annotated[float, Limits(-90, 90, unit="degrees")] = 30.0
     start: Annotated[float, _ANGLE] = 0.0  # azimuth of the first frame
     sweep: Annotated[float, _ANGLE] = 0.0  # azimuth covered by the video
@@ -293,6 +294,7 @@ class Scene(Section, frozen=True):
 _COLLIDERS = ("planes", "boxes", "spheres", "capsules", "cylinders")
 
 
+@checked
 def load_scene(path: str | Path, *, accuracy: str | None = None) -> Scene:
     """Read and check a scene file. Host.
 

@@ -12,7 +12,7 @@ import numpy as np
 from pigjax import io
 from pigjax.camera import Camera, orbit
 from pigjax.scene.plan import axis_of
-from pigjax.splat import Gaussians, RenderConfig, render
+from pigjax.splat import Gaussians, RenderConfig, extent_of, render
 
 _VIEW = 50.0  # field of view [degrees]
 
@@ -31,7 +31,8 @@ def turntable(
 ) -> Camera:
     """Draw the cloud from all around into a video, or one picture of it into a `.png`. Host.
 
-    The camera looks at the middle of what is opaque, from so far that nearly all of it fits in.
+    The camera looks at the middle of the scene's dense core, from so far that nearly all of it fits in; see
+    `scene_extent`. Floaters, however far, move neither.
 
     Args:
         gaussians: the scene.
@@ -48,16 +49,13 @@ def turntable(
         The cameras.
 
     Raises:
-        InputError: unknown suffix or axis, or the file cannot be written.
+        InputError: unknown suffix or axis, no Gaussian with a finite centre, or the file cannot be written.
     """
-    means, weight = np.asarray(gaussians.means, float), np.asarray(jax.nn.sigmoid(gaussians.logit_opacities), float)
-    seen = means[np.isfinite(means).all(1) & (weight > 0.1)]
-    middle = np.median(seen if len(seen) else means, axis=0)
-    reach = float(np.quantile(np.linalg.norm(seen - middle, axis=1), 0.95)) if len(seen) else 1.0
+    extent = extent_of(gaussians)
     single = Path(path).suffix.lower() == ".png"
     cameras = orbit(
-        middle,
-        radius=1.25 * reach / np.sin(np.radians(_VIEW / 2)),
+        extent.centre,
+        radius=1.25 * extent.radius / np.sin(np.radians(_VIEW / 2)),
         elevation=np.radians(elevation),
         frames=1 if single else frames,
         focal=size / (2 * np.tan(np.radians(_VIEW / 2))),

@@ -21,6 +21,7 @@ from jax import lax
 from jaxtyping import Array, Float
 from scipy.cluster.vq import kmeans2
 
+from pigjax.arguments import checked
 from pigjax.boxes import box_for
 from pigjax.camera import Camera
 from pigjax.checks import suggest
@@ -236,6 +237,7 @@ class Experiment(eqx.Module):
         return replace(self, gravity=value)
 
 
+@checked
 def experiment(
     scene: Scene,
     *,

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pigjax import io
+from pigjax.arguments import checked
 from pigjax.errors import SceneError
 from pigjax.study.experiment import Experiment, Outcome, experiment
 from pigjax.study.objectives import Objective, Scores, check_aim, objective_of
@@ -25,6 +26,7 @@ Row = Mapping[str, Any]
 _SOFT_VOTES = 0.002  # temperature of a tuned vote that states none: a wider one tells no small tau_d from a larger
 
 
+@checked
 def sweep_study(study: Study, out_dir: str | Path, *, progress: Callable[[int, int], Any] | None = None) -> Table:
     """Score every set of parameters of a study. Host.
 
@@ -57,6 +59,7 @@ def sweep_study(study: Study, out_dir: str | Path, *, progress: Callable[[int, i
     return table
 
 
+@checked
 def tune_study(
     study: Study, out_dir: str | Path, *, progress: Callable[[int, int, str], Any] | None = None
 ) -> tuple[Row, History]:

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from msgspec import field
 
+from pigjax.arguments import checked
 from pigjax.checks import LARGEST_WHOLE, Limits, joined, suggest
 from pigjax.errors import SceneError
 from pigjax.scene.decode import Section, decode
@@ -224,6 +225,7 @@ def _put(values: dict[str, Any], name: str, value: Any) -> None:
     values[last] = value
 
 
+@checked
 def load_study(path: str | Path, *, method: str | None = None) -> Study:
     """Read and check a study file; `method`, if given, is that of `tune`. Host.
 

@@ -15,6 +15,7 @@ import numpy as np
 import optax
 
 from pigjax import io
+from pigjax.arguments import checked
 from pigjax.errors import InputError, SimulationError
 from pigjax.tune.bounds import Bounds, bounds_of
 from pigjax.tune.history import History, Recorder, Step
@@ -34,6 +35,7 @@ class _State(NamedTuple):
     restarts: Any  # used
 
 
+@checked
 def fit(
     loss: Callable[..., Any],
     params: Any,

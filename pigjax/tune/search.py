@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pigjax.arguments import checked
 from pigjax.errors import InputError, SimulationError
 from pigjax.io.files import writing
 from pigjax.tune.fit import fingerprint, flat_parameters
@@ -22,6 +23,7 @@ from pigjax.tune.history import History, Recorder, Step
 _SPREAD = 0.5  # of the first candidates, in the unconstrained numbers
 
 
+@checked
 def search(
     loss: Callable[..., Any],
     params: Any,

@@ -18,6 +18,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from pigjax import io
+from pigjax.arguments import checked
 from pigjax.errors import InputError, SimulationError
 from pigjax.tune.table import Table, columns_of
 
@@ -28,6 +29,7 @@ Function = Callable[..., Any]
 Progress = Callable[[int, int], Any]  # rows done, of
 
 
+@checked
 def sweep(
     fn: Function,
     grid_of_parameters: Mapping[str, Any] | Sequence[Any],

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Shaped
 
 from pigjax import io
+from pigjax.arguments import checked
 from pigjax.errors import InputError
 
 Columns = Mapping[str, Shaped[np.ndarray, "..."]]
@@ -175,6 +176,7 @@ class Table:
         io.write_parquet(path, self._flat())
 
 
+@checked
 def load_table(path: PathLike) -> Table:
     """A table that `Table.save` wrote as `.npz`. Host.
 
