@@ -10,13 +10,17 @@ from pigjax.errors import InputError
 from pigjax.matter.state import WALL
 from pigjax.transfers import KERNELS
 
-_WALLS = ("separate", "slip", "sticky")
+_WALLS = (None, "separate", "slip", "sticky")
 _INTEGRATORS = ("explicit", "implicit", "auto")
 _DIFFERENTIATION = ("reverse", "forward")
 
 
 class SimConfig(eqx.Module):
     """Every choice of the simulation that is compiled in.
+
+    The outer nodes of a grid are walls. Without `walls` they hold as "separate" does, and matter that moves into them
+    is a problem of the simulation's health (`Health.wall_hits`), since there the grid ended and not the world. To name
+    a kind of wall says that it belongs to the scene: nothing is counted then.
 
     Raises:
         InputError: a choice does not exist or a number is out of range.
@@ -26,7 +30,7 @@ class SimConfig(eqx.Module):
     integrator: str = static_field(default="explicit")  # "implicit": waves do not limit its steps; or "auto"
     substeps: int | None = static_field(default=None)  # per frame; None: the fewest that are stable
     cfl: float = static_field(default=0.4)  # share of a cell that waves and particles cross in a step
-    walls: str = static_field(default="separate")  # of the domain: "separate", "slip" or "sticky"
+    walls: str | None = static_field(default=None)  # that the scene wants: "separate", "slip" or "sticky"
     visual_stretch: tuple[float, float] = static_field(default=(0.2, 5.0))  # bounds of F_visual's singular values
     force: bool = static_field(default=False)  # run steps longer than the stable limit
     stop: bool = static_field(default=False)  # at the first bad frame: the rest repeats the last good one
@@ -46,7 +50,7 @@ class SimConfig(eqx.Module):
             ("differentiation", self.differentiation, _DIFFERENTIATION),
         ):
             if value not in choices:
-                raise InputError(f"SimConfig.{name} = {value!r}: choose one of {', '.join(choices)}.")
+                raise InputError(f"SimConfig.{name} = {value!r}: choose one of {', '.join(map(str, choices))}.")
         if self.substeps is not None and self.substeps < 1:
             raise InputError(f"SimConfig.substeps = {self.substeps}: must be 1 or more.")
         if self.box is not None and not (

@@ -136,8 +136,7 @@ def objective_of(function: str, options: dict[str, Any], folder: Path) -> Object
 
 
 def _healthy(objective: Objective, outcome: Outcome) -> Scores:
-    health = outcome.health
-    broken = (health.nonfinite > 0) | (health.max_courant >= 1) | (health.escaped > 0)
+    broken = outcome.health.is_broken()
     return {name: jnp.where(broken, jnp.nan, score) for name, score in objective(outcome).items()}
 
 
