@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from pigjax.arrays import array_field, einsum, static_field
+from pigjax.arrays import array_field, einsum, in_precision, static_field
 from pigjax.bands import collect, spread
 from pigjax.camera import Camera, stack_cameras, to_camera
 from pigjax.errors import InputError
@@ -143,7 +143,9 @@ def render(
         raise InputError("outputs has 'features': pass features, the channels [n f] of each splat.")
     given = {"object_weights": object_weights, "features": features}
     given = {name: values for name, values in given.items() if name in outputs}
-    tau_T, background = jnp.asarray(tau_T), jnp.asarray(background)
+    dtype = gaussians_or_splats.means.dtype
+    tau_T, background = jnp.asarray(tau_T, dtype), jnp.asarray(background, dtype)
+    camera, given = in_precision((camera, given), dtype)
     return _render(gaussians_or_splats, camera, config, background, tuple(outputs), given, tau_T)
 
 
@@ -295,6 +297,7 @@ def sh_basis(directions: Float[Array, "n 3"], degree: int) -> Float[Array, "n k"
 
 def project_splats(splats: Splats, camera: Camera, config: RenderConfig) -> Projected:
     """EWA projection from the factor: 2D covariance = (J W M)(J W M)ᵀ + dilation (Zwicker et al. 2001)."""
+    camera = in_precision(camera, splats.means.dtype)
     fx, fy = camera.focal
     cx, cy = camera.centre
     x, y, depth = to_camera(splats.means, camera).T

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.errors import InputError, SimulationError
 
+_ROOM = "give the grid more room (fit_grid's margin, or vast_grid), or name the walls that are wanted (SimConfig.walls)"
 _NAMED = 3  # members of a batch that a message describes
 
 
@@ -121,10 +122,7 @@ class StepHealth(eqx.Module):
         if unstable or self.unconverged > 0:
             yield "take more substeps (or a lower cfl), a larger grid (or SimConfig.box), or softer or slower matter"
         if self.wall_hits > 0:
-            yield (
-                'give the grid more room (fit_grid\'s margin, or vast_grid), or say SimConfig(walls="separate") where'
-                + (" the wall is wanted")
-            )
+            yield _ROOM
 
     def _where(self) -> str:
         return ""
