@@ -146,9 +146,8 @@ def _box_around(particles, table, domain, shape, duration, gravity):
     low, high = _ends(particles.x, particles.v, duration, gravity, _moving(particles, table))
     middle = (jnp.where(low <= high, (low + high) / 2, domain.origin) - domain.origin) / domain.dx
     sides = np.array(domain.shape)
-    first = lax.stop_gradient(
-        jnp.clip(jnp.round(middle - (jnp.asarray(shape, middle.dtype) - 1) / 2), 0, sides - shape)
-    )
+    half = (jnp.asarray(shape, middle.dtype) - 1) / 2
+    first = lax.stop_gradient(jnp.clip(jnp.round(middle - half), 0, sides - shape))
     grid = Grid(domain.origin + domain.dx * first, domain.dx, shape)
     return Box(grid, first.astype(jnp.int32), jnp.asarray(sides, jnp.int32))
 

@@ -100,10 +100,9 @@ def choose_substeps(
     if config.integrator == "auto":
         steps: dict[str, Any] = {"frames": frames, "frame_dt": frame_dt, "gravity": gravity, "colliders": colliders}
         config = choose_integrator(particles, grid, table, config, **steps)
-    time = frames * float(frame_dt)
-    needed = _substeps_needed(
-        particles, grid, table, config, float(frame_dt), gravity, colliders, fall=time, until=time
-    )
+    duration = float(frame_dt)
+    time = frames * duration
+    needed = _substeps_needed(particles, grid, table, config, duration, gravity, colliders, fall=time, until=time)
     unit = 2 ** max(needed.bit_length() - 4, 0)
     return max(-(-needed // unit) * unit, 1)
 
@@ -253,12 +252,11 @@ def rollout(
     if substeps is None:
         config, substeps = first_substeps(particles, grid, table, config, **steps)
         if _is_open(grid):
-            now = {"frame_dt": float(frame_dt), "gravity": gravity, "colliders": colliders}
+            now: dict[str, Any] = {"frame_dt": float(frame_dt), "gravity": gravity, "colliders": colliders}
             choose = partial(frame_substeps, substeps, grid=grid, table=table, config=config, **now)
     else:
         config = choose_integrator(particles, grid, table, config, **steps)
     _check_dt(float(frame_dt) / substeps, particles, grid, table, config, colliders)
-    frame_dt = _like(frame_dt, particles)
     shared = _like((grid, table, jnp.asarray(gravity), colliders, contact), particles)
     grid, table, gravity, colliders, contact = shared
     return run_in_boxes(
@@ -267,7 +265,7 @@ def rollout(
         table,
         config,
         frames=frames,
-        frame_dt=frame_dt,
+        frame_dt=_like(frame_dt, particles),
         gravity=gravity,
         colliders=colliders,
         contact=contact,
