@@ -246,7 +246,8 @@ def _check(shape, bodies, state, before, volume, inner):
         width = shape[0] // bodies
         start = jnp.floor(before[:1] / width) * width * np.eye(3, 1, dtype=before.dtype)
         low, high = low + start, high + start
-        inner = None if inner is None else inner + start
+    else:
+        start = 0.0
     held = jnp.clip(state.cells, low, high)
     J, speed_squared = determinant(by_component(state.F)), (state.v**2).sum(0)
     alive = (volume[0] > 0) & ~jnp.isnan(J) & ~jnp.isnan(speed_squared)  # what is not is counted as such
@@ -257,7 +258,7 @@ def _check(shape, bodies, state, before, volume, inner):
         out=out,
         escaped=out.any((0, 1)).astype(int),
         inverted=(alive & (J <= 0)).astype(int),
-        wall_hits=None if inner is None else (alive & _hits(state.cells, before, inner)).astype(int),
+        wall_hits=None if inner is None else (alive & _hits(state.cells - start, before - start, inner)).astype(int),
     )
     ok = jnp.isfinite(sum(rows.sum(0) for rows in jax.tree.leaves(state._replace(cells=held))))
     return ok, held, jax.tree.map(lax.stop_gradient, tally)
