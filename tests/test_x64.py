@@ -39,7 +39,7 @@ def precisions(tree):
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_pictures_have_the_precision_of_the_gaussians(x64, dtype):
     gaussians, views = ball(dtype), cameras()
-    frame = render(gaussians, views[0], background=np.ones(3), outputs=("rgb", "alpha", "depth"))
+    frame = render(gaussians, views[0], background=jnp.ones(3), outputs=("rgb", "alpha", "depth"))
     assert precisions(frame) == precisions(unproject(frame.depth, views[0])) == {np.dtype(dtype)}
 
 
