@@ -28,10 +28,11 @@ def health_record(particles: Particles, health: Health | None, gravity: Float[np
     x, v, mass = (np.asarray(a, np.float64) for a in (particles.x, particles.v, particles.mass))
     known = np.isfinite(x).all(1) & np.isfinite(v).all(1) & np.isfinite(mass)
     x, v, mass = x[known], v[known], mass[known]
+    height = -(x * np.asarray(gravity, np.float64)).sum(1)  # times the strength of gravity [m²/s²]
     return record | {
         "kinetic_energy": np.asarray((mass * (v**2).sum(1)).sum() / 2),
-        "gravity_energy": np.asarray(-(mass @ x) @ np.asarray(gravity, np.float64)),
-        "momentum": mass @ v,
+        "gravity_energy": np.asarray((mass * height).sum()),
+        "momentum": (mass[:, None] * v).sum(0),
     }
 
 
