@@ -7,6 +7,7 @@ grad and vmap it is one program on the whole grid, or on a box of fixed size tha
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -259,7 +260,7 @@ def rollout(
     _check_dt(float(frame_dt) / substeps, particles, grid, table, config, colliders)
     shared = _like((grid, table, jnp.asarray(gravity), colliders, contact), particles)
     grid, table, gravity, colliders, contact = shared
-    return run_in_boxes(
+    end, path, health = run_in_boxes(
         particles,
         grid,
         table,
@@ -273,6 +274,13 @@ def rollout(
         choose=choose,
         fit=None if sleep is None else Sleeper(settings=sleep, body=np.asarray(particles.body)),
     )
+    if config.walls is None and (hits := int(health.wall_hits)):
+        warnings.warn(
+            f"{hits} particles met the wall of their grid, which holds them back: give the grid more room (fit_grid's"
+            " margin, or vast_grid), or name the walls that are wanted, SimConfig(walls=...).",
+            stacklevel=2,
+        )
+    return end, path, health
 
 
 def _in_one_box(particles, grid, table, config, dt, around, frames, substeps):

@@ -19,8 +19,8 @@ class SimConfig(eqx.Module):
     """Every choice of the simulation that is compiled in.
 
     The outer nodes of a grid are walls. Without `walls` they hold as "separate" does, and matter that moves into them
-    is a problem of the simulation's health (`Health.wall_hits`), since there the grid ended and not the world. To name
-    a kind of wall says that it belongs to the scene: nothing is counted then.
+    is counted (`Health.wall_hits`) and `rollout` warns of it, since there the grid ended and not the world. To name a
+    kind of wall says that it belongs to the scene: nothing is counted then.
 
     Raises:
         InputError: a choice does not exist or a number is out of range.

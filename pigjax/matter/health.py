@@ -19,8 +19,9 @@ _NAMED = 3  # members of a batch that a message describes
 class StepHealth(eqx.Module):
     """What went wrong in a step, as data.
 
-    One meaning everywhere: `problems` lists something exactly where `is_bad` holds, where `raise_if_bad` raises, and
-    where `SimConfig.stop` stops. `is_broken` is the part of it after which the numbers are not to be used.
+    One meaning everywhere: where `is_bad` holds, `raise_if_bad` raises, `SimConfig.stop` stops, `problems` says why.
+    `is_broken` is the part of it after which the numbers are not to be used. Matter that met a wall is told in
+    `problems` but not bad, since a scene may rest on the walls of its grid.
     """
 
     min_J: Float[Array, "*b"]  # smallest determinant of F
@@ -36,15 +37,15 @@ class StepHealth(eqx.Module):
         return self.is_broken() | (self.inverted > 0) | (self.unconverged > 0)
 
     def is_broken(self) -> Bool[Array, "*b"]:
-        """Whether matter was lost, left the grid, met its wall or outran the transfers.
+        """Whether matter was lost, left the grid or outran the transfers.
 
         Matter that was turned inside out may recover, and a step that missed its balance is less accurate.
         """
-        lost = self.escaped + self.nonfinite + self.wall_hits > 0
+        lost = self.escaped + self.nonfinite > 0
         return jnp.asarray(lost | ~(self.max_courant < 1))  # NaN counts too
 
     def problems(self) -> list[str]:
-        """What is wrong, one clause each; of a batch, one for each of its members that is bad (host).
+        """What is wrong, and whether walls were met, one clause each; of a batch, one for each of its members (host).
 
         Raises:
             InputError: the numbers are traced by jit, grad or vmap.
@@ -52,7 +53,7 @@ class StepHealth(eqx.Module):
         return self._clauses(len(self._members()))
 
     def raise_if_bad(self) -> None:
-        """Raise if anything is wrong (host).
+        """Raise if it is bad (host).
 
         Raises:
             SimulationError: naming every problem and the remedy; of a batch, which of its members are bad.
@@ -94,7 +95,8 @@ class StepHealth(eqx.Module):
         if not np.ndim(self.min_J):
             return members[0]._own_clauses()
         places = list(np.ndindex(np.shape(self.min_J)))
-        told = ((place, member) for place, member in zip(places, members) if member.is_bad())
+        told = [(place, member) for place, member in zip(places, members) if member._own_clauses()]
+        told.sort(key=lambda item: not item[1].is_bad())
         return [
             f"member {', '.join(map(str, place))}: {', '.join(member._own_clauses())}{member._where()}"
             for (place, member), _ in zip(told, range(most))

@@ -136,7 +136,8 @@ def objective_of(function: str, options: dict[str, Any], folder: Path) -> Object
 
 
 def _healthy(objective: Objective, outcome: Outcome) -> Scores:
-    broken = outcome.health.is_broken()
+    health = outcome.health
+    broken = health.is_broken() | (health.wall_hits > 0)  # no scene of a study asks for the walls of its grid
     return {name: jnp.where(broken, jnp.nan, score) for name, score in objective(outcome).items()}
 
 
