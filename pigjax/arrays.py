@@ -34,6 +34,16 @@ def as_float(value: int | float) -> float:
         return float("inf") if value > 0 else float("-inf")
 
 
+def in_precision(tree: Any, dtype: Any) -> Any:
+    """The same tree with its real arrays in a precision: what is computed has that of the Gaussians or particles."""
+
+    def converted(leaf):
+        real = isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.floating)
+        return jnp.asarray(leaf, dtype) if real and leaf.dtype != dtype else leaf
+
+    return jax.tree.map(converted, tree)
+
+
 def array_field(*, limits: Any = None, **kwargs: Any) -> Any:
     """Dynamic field that a user may sweep; a float given here never recompiles. `check_fields` reads `limits`."""
     return eqx.field(converter=as_array, metadata={"limits": limits}, **kwargs)

@@ -7,7 +7,7 @@ means that the frame is computed again in a larger one; inside jit, grad and vma
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from pigjax.errors import SimulationError
 from pigjax.frames import Box, run_frames
@@ -23,7 +23,7 @@ from pigjax.materials import LAWS, MaterialTable
 from pigjax.matter import WALL, Grid, Health, Particles, SimConfig, Trajectory, perfect_health
 
 _SMALL = 50_000  # nodes that need no box: less than other costs of a step
-_LARGEST = 200_000_000  # nodes
+LARGEST = 200_000_000  # nodes
 _ROOM = 1.3  # a box is made so much longer than it must be: another size is another compilation
 _ROOM_OF_ONE = 1.15  # the same of a box of fixed size, for what is faster than what was seen
 _UNIT = 4  # nodes, of which sides are multiples
@@ -38,22 +38,31 @@ def run_in_boxes(
     config: SimConfig,
     *,
     frames: int,
+    frame_dt: Float[Array, ""],
+    substeps: int,
+    choose: Callable[..., int] | None = None,
     fit: Fit | None = None,
     **step,
 ) -> tuple[Particles, Trajectory, Health]:
-    """Simulate frame by frame, each as `fit` does, on the box that it needs; `step` is what `run_frames` takes."""
+    """Simulate frame by frame, each as `fit` does, on the box that it needs; `step` is what `run_frames` takes.
+
+    `choose(particles, frame=...)` gives the substeps of each frame, where not all have the same.
+    """
     devices = devices_for(config, len(particles))
-    if fit is None and math.prod(domain.shape) <= _SMALL:
-        box, start = whole(domain), jnp.zeros_like(step["dt"])
+    step |= {"dt": frame_dt / substeps, "substeps": substeps}
+    if fit is None and choose is None and math.prod(domain.shape) <= _SMALL:
+        box, start = whole(domain), jnp.zeros_like(frame_dt)
         return run_frames(particles, box, table, config, devices, start=start, frames=frames, **step)[:3]
     fit = fit or Fit()
-    duration = step["dt"] * step["substeps"]
     paths: list[Trajectory] = []
     healths: list[Health] = []
     for frame in range(frames):
         before = particles
+        if choose is not None:
+            substeps = choose(particles, frame=frame)
+            step |= {"dt": frame_dt / substeps, "substeps": substeps}
         particles, path, health = fit.frame(
-            particles, domain, table, config, devices, start=duration * frame, frames=1, **step
+            particles, domain, table, config, devices, start=frame_dt * frame, frames=1, **step
         )
         stops = config.stop and health.first_bad_frame >= 0
         if stops and paths:  # the last good frame to the digit, where a box's origin would round it anew
@@ -137,7 +146,8 @@ def _box_around(particles, table, domain, shape, duration, gravity):
     low, high = _ends(particles.x, particles.v, duration, gravity, _moving(particles, table))
     middle = (jnp.where(low <= high, (low + high) / 2, domain.origin) - domain.origin) / domain.dx
     sides = np.array(domain.shape)
-    first = lax.stop_gradient(jnp.clip(jnp.round(middle - (np.array(shape) - 1) / 2), 0, sides - shape))
+    half = (jnp.asarray(shape, middle.dtype) - 1) / 2
+    first = lax.stop_gradient(jnp.clip(jnp.round(middle - half), 0, sides - shape))
     grid = Grid(domain.origin + domain.dx * first, domain.dx, shape)
     return Box(grid, first.astype(jnp.int32), jnp.asarray(sides, jnp.int32))
 
@@ -213,9 +223,9 @@ class Fit:
             room = -(-(needed * _ROOM).astype(int) // _UNIT) * _UNIT
             shape = room if wasteful else np.maximum(room, shape)
         shape = np.minimum(shape, sides)
-        if (nodes := _nodes(shape)) > _LARGEST:
+        if (nodes := _nodes(shape)) > LARGEST:
             raise SimulationError(
-                f"matter has spread so far that its grid needs {nodes:.2g} nodes (at most {_LARGEST:.2g}); catch what"
+                f"matter has spread so far that its grid needs {nodes:.2g} nodes (at most {LARGEST:.2g}); catch what"
                 " falls with a plane, or take a coarser grid."
             )
         low = np.clip(low - (shape - needed) // 2, 0, sides - shape)

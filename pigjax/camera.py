@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pigjax.arguments import checked
-from pigjax.arrays import Vector, array_field, einsum, matmul, static_field
+from pigjax.arrays import Vector, array_field, einsum, in_precision, matmul, static_field
 from pigjax.errors import InputError
 from pigjax.linalg import quat_to_matrix
 
@@ -143,11 +143,13 @@ def to_camera(points: Float[Array, "*n 3"], camera: Camera) -> Float[Array, "*n 
         InputError: the camera is a batch.
     """
     require_one(camera, "camera")
+    camera = in_precision(camera, points.dtype)
     return matmul(points, camera.world_to_cam[:3, :3].T) + camera.world_to_cam[:3, 3]
 
 
 def project(points: Float[Array, "*n 3"], camera: Camera) -> tuple[Float[Array, "*n 2"], Float[Array, "*n"]]:
     """Pixel coordinates [px] and camera depth z [m] of world points; points with z <= 0 are behind the camera."""
+    camera = in_precision(camera, points.dtype)
     local = to_camera(points, camera)
     depth = local[..., 2]
     safe = jnp.where(depth > 0, depth, 1.0)
@@ -161,8 +163,9 @@ def unproject(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "h w 3
         InputError: the camera is a batch.
     """
     require_one(camera, "camera")
-    x = (jnp.arange(camera.width) + 0.5 - camera.centre[0]) / camera.focal[0]
-    y = (jnp.arange(camera.height) + 0.5 - camera.centre[1]) / camera.focal[1]
+    camera = in_precision(camera, depth.dtype)
+    x = (jnp.arange(camera.width, dtype=depth.dtype) + 0.5 - camera.centre[0]) / camera.focal[0]
+    y = (jnp.arange(camera.height, dtype=depth.dtype) + 0.5 - camera.centre[1]) / camera.focal[1]
     x, y = jnp.broadcast_arrays(x[None, :], y[:, None])
     local = jnp.stack([x, y, jnp.ones_like(x)], -1) * depth[..., None]
     rotation, translation = camera.world_to_cam[:3, :3], camera.world_to_cam[:3, 3]

@@ -107,7 +107,7 @@ def check_fields(thing: Any) -> None:
         if isinstance(value, jax.core.Tracer) or (value is None and "None" in wanted):
             continue
         if choices is not None:
-            if not isinstance(value, str) or value not in choices:
+            if not isinstance(value, str | None) or value not in choices:
                 raise InputError(f"{name} = {shown(value)}: {suggest(value, choices)}.")
             continue
         kind = next((kind for kind in wanted if kind != "None"), "")

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from pigjax.arrays import everywhere
 from pigjax.colliders import Collider
 from pigjax.contact import BodyContact
+from pigjax.errors import InputError
 from pigjax.implicit import balanced_velocity
 from pigjax.materials import MaterialTable
 from pigjax.matter import (
@@ -69,6 +70,8 @@ def run_frames(
 
     Reverse mode keeps states for a simulation of frames `of` which these are a part.
     """
+    if config.integrator == "auto":
+        raise InputError("SimConfig.integrator = 'auto' is undecided: take what choose_integrator finds.")
     kernel, dtype = KERNELS[config.kernel], particles.x.dtype
     grid = box.grid
     grouping = group_by_law(particles, table, grid, devices, apart=contact is not None)
@@ -212,14 +215,15 @@ def _counted(setting, watch, states):
     watch, states = jax.tree.map(lax.stop_gradient, (watch, states))
     health = watch.health
     gone = sum((state.volume <= 0).sum() for state in states)
-    counts = jnp.stack([health.escaped, health.inverted, gone])
+    counts = jnp.stack([health.escaped, health.inverted, health.wall_hits, gone])
     least, most, met = health.min_J, health.max_courant, watch.met
     if setting.axis is not None:
         counts = lax.psum(counts, setting.axis)
         least, most = lax.pmin(least, setting.axis), lax.pmax(most, setting.axis)
         met = lax.pmax(met.astype(int), setting.axis) > 0
-    escaped, inverted, gone = counts
-    health = StepHealth(least, most, escaped, gone - setting.fillers, inverted, health.unconverged)
+    escaped, inverted, wall_hits, gone = counts
+    nonfinite = gone - setting.fillers
+    health = StepHealth(least, most, escaped, nonfinite, inverted, health.unconverged, wall_hits)
     return Watch(health, met)
 
 

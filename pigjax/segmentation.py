@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, Integer, Num
 from scipy.spatial import cKDTree
 
 from pigjax.arguments import checked
-from pigjax.arrays import array_field
+from pigjax.arrays import array_field, in_precision
 from pigjax.camera import Camera
 from pigjax.chunks import static_capacity
 from pigjax.errors import InputError
@@ -120,7 +120,7 @@ def lift_masks(
     temperature = None if temperature is None else jnp.asarray(temperature, dtype)
     thresholds = jnp.asarray(tau_T, dtype), jnp.asarray(tau_d, dtype), temperature
     settled = weighting == "centre" and temperature is None and ties == "alpha"
-    splats, masks = as_splats(gaussians), jnp.asarray(masks)
+    splats, masks, cameras = as_splats(gaussians), jnp.asarray(masks), in_precision(cameras, dtype)
     walks = enough_capacity(gaussians, cameras, config) if settled or temperature is not None else config
     drawn = config if temperature is None else walks
     votes, overflow = _collect(splats, cameras, masks, thresholds, num_ids, weighting, drawn)

@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from pigjax.arguments import checked
-from pigjax.arrays import array_field, einsum, static_field
+from pigjax.arrays import array_field, einsum, in_precision, static_field
 from pigjax.bands import collect, spread
 from pigjax.camera import Camera, require_one, stack_cameras, to_camera
 from pigjax.checks import LARGEST_WHOLE, Limits, check_fields
@@ -172,7 +172,9 @@ def render(
     given = {"object_weights": object_weights, "features": features}
     given = {name: values for name, values in given.items() if name in outputs}
     require_one(camera, "camera")
-    tau_T, background = jnp.asarray(tau_T), jnp.asarray(background)
+    dtype = gaussians_or_splats.means.dtype
+    tau_T, background = jnp.asarray(tau_T, dtype), jnp.asarray(background, dtype)
+    camera, given = in_precision((camera, given), dtype)
     return _render(gaussians_or_splats, camera, config, background, tuple(outputs), given, tau_T)
 
 
@@ -333,6 +335,7 @@ def sh_basis(directions: Float[Array, "n 3"], degree: int) -> Float[Array, "n k"
 
 def project_splats(splats: Splats, camera: Camera, config: RenderConfig) -> Projected:
     """EWA projection from the factor: 2D covariance = (J W M)(J W M)ᵀ + dilation (Zwicker et al. 2001)."""
+    camera = in_precision(camera, splats.means.dtype)
     fx, fy = camera.focal
     cx, cy = camera.centre
     x, y, depth = to_camera(splats.means, camera).T

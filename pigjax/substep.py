@@ -33,12 +33,14 @@ from pigjax.transfers import (
     stage,
 )
 
+_STILL = 1e-5  # displacement of a step that is none: what rounding moves [cells]
+
 
 class Setting(NamedTuple):
     """What is compiled in."""
 
     kernel: Kernel
-    walls: str
+    walls: str | None
     laws: tuple[str, ...]  # that move
     ruled: bool  # reverse mode by the rules of `passes`
     balance: Callable | None  # the implicit integrator, which finds the velocities that stresses balance
@@ -90,8 +92,11 @@ class Watch(eqx.Module):
 
     def beside(self, other: Watch) -> Watch:
         """Of two groups in the same step: the worse of both, and counts add up."""
-        counts = [watch.health.escaped for watch in (self, other)], [watch.health.inverted for watch in (self, other)]
-        return eqx.tree_at(lambda w: (w.health.escaped, w.health.inverted), self.worse(other), tuple(map(sum, counts)))
+
+        def counts(watch):
+            return watch.health.escaped, watch.health.inverted, watch.health.wall_hits
+
+        return eqx.tree_at(counts, self.worse(other), tuple(map(sum, zip(counts(self), counts(other)))))
 
 
 class Tally(NamedTuple):
@@ -102,6 +107,7 @@ class Tally(NamedTuple):
     out: Bool[Array, "3 2 c"]  # past a side of the box
     escaped: Int[Array, "c"]
     inverted: Int[Array, "c"]
+    wall_hits: Int[Array, "c"] | None  # None: they are not counted
 
     def joined(self, other: Tally) -> Tally:
         """Of both chunks; counts add up."""
@@ -111,6 +117,7 @@ class Tally(NamedTuple):
             self.out | other.out,
             self.escaped + other.escaped,
             self.inverted + other.inverted,
+            None if self.wall_hits is None or other.wall_hits is None else self.wall_hits + other.wall_hits,
         )
 
     def watch(self, cells_per_speed: Float[Array, ""]) -> Watch:
@@ -122,14 +129,15 @@ class Tally(NamedTuple):
             nonfinite=jnp.zeros((), int),
             inverted=self.inverted.sum(),
             unconverged=jnp.zeros((), int),
+            wall_hits=jnp.zeros((), int) if self.wall_hits is None else self.wall_hits.sum(),
         )
         return Watch(health, self.out.any(2))
 
 
-def _no_tally(like: Float[Array, "_ c"]) -> Tally:
+def _no_tally(like: Float[Array, "_ c"], counts_walls: bool) -> Tally:
     lanes, zero = like.shape[-1], jnp.zeros_like(like[0])
     count = jnp.zeros(lanes, int)
-    return Tally(zero + jnp.inf, zero, jnp.zeros((3, 2, lanes), bool), count, count)
+    return Tally(zero + jnp.inf, zero, jnp.zeros((3, 2, lanes), bool), count, count, count if counts_walls else None)
 
 
 def advance(
@@ -166,11 +174,12 @@ def from_grid(
     with jax.named_scope("on_grid"):
         velocity, converged = _on_grid(setting, scene, states, nodes, time)
     watch, moved = eqx.tree_at(lambda w: w.health.unconverged, nothing, jnp.asarray(converged) ^ True), []
+    inner = _between_walls(setting, scene) if setting.walls is None else None
     for law, parameters, state in zip(setting.laws, scene.parameters, states):
         take = Pass(partial(_take, setting, scene.nodes, scene.bodies, law), setting.kernel, scene.nodes)
-        shared = (scene.dt, scene.grid.dx, parameters)
+        shared = (scene.dt, scene.grid.dx, parameters, inner)
         with jax.named_scope("from_grid"):
-            none = _no_tally(state.cells[0])
+            none = _no_tally(state.cells[0], inner is not None)
             state, tally = gather_chunks(take, scene.go, velocity, state, shared, none, ruled=setting.ruled)
         moved.append(state)
         watch = watch.beside(lax.stop_gradient(tally.watch(scene.dt / scene.grid.dx)))
@@ -206,23 +215,30 @@ def _give(setting, go, at, chunk, shared):
 
 def _take(setting, shape, bodies, law, go, at, windows, state, shared):
     """A chunk after the step, and its tally."""
-    dt, dx, parameters = shared
+    dt, dx, parameters, inner = shared
     transfer = ruled_collect if setting.ruled else collect
     moments = transfer(setting.kernel, go, at, windows)
     v, per_cell = stage(go, partial(apic, setting.kernel), at.distance, moments)
     with jax.named_scope("law"):
         new = in_rows(stage(go, partial(_respond, law), by_components(state), v, per_cell, dt, dx, parameters))
-    return _settle(shape, bodies, go, new, state)
+    return _settle(shape, bodies, go, new, state, inner)
 
 
-def _settle(shape, bodies, go, new, state):
+def _settle(shape, bodies, go, new, state, inner):
     """A chunk held in the grid, without what is not finite, and its tally."""
     with jax.named_scope("health"):
-        ok, held, tally = stage(go, partial(_check, shape, bodies), new, state.cells, state.volume)
+        ok, held, tally = stage(go, partial(_check, shape, bodies), new, state.cells, state.volume, inner)
         return _only_finite(ok, new._replace(cells=held), shape), tally
 
 
-def _check(shape, bodies, state, before, volume):
+def _between_walls(setting, scene):
+    """Lowest and highest cells [3 2] of particles whose kernel touches no node of the domain's walls."""
+    reach = len(setting.kernel.offsets) / 2
+    ends = jnp.stack([WALL - 1 + reach - scene.low, scene.domain - WALL - reach - scene.low], 1)
+    return lax.stop_gradient(ends.astype(scene.dt.dtype))
+
+
+def _check(shape, bodies, state, before, volume, inner):
     """Which particles are finite, the cells that the grid holds them in, and the health."""
     low, high = np.ones((3, 1)), np.array(shape)[:, None] / np.array([[bodies], [1], [1]]) - 2.0
     low, high = low.astype(before.dtype), high.astype(before.dtype)
@@ -230,6 +246,8 @@ def _check(shape, bodies, state, before, volume):
         width = shape[0] // bodies
         start = jnp.floor(before[:1] / width) * width * np.eye(3, 1, dtype=before.dtype)
         low, high = low + start, high + start
+    else:
+        start = 0.0
     held = jnp.clip(state.cells, low, high)
     J, speed_squared = determinant(by_component(state.F)), (state.v**2).sum(0)
     alive = (volume[0] > 0) & ~jnp.isnan(J) & ~jnp.isnan(speed_squared)  # what is not is counted as such
@@ -240,9 +258,16 @@ def _check(shape, bodies, state, before, volume):
         out=out,
         escaped=out.any((0, 1)).astype(int),
         inverted=(alive & (J <= 0)).astype(int),
+        wall_hits=None if inner is None else (alive & _hits(state.cells - start, before - start, inner)).astype(int),
     )
     ok = jnp.isfinite(sum(rows.sum(0) for rows in jax.tree.leaves(state._replace(cells=held))))
     return ok, held, jax.tree.map(lax.stop_gradient, tally)
+
+
+def _hits(cells, before, inner):
+    """Which particles have moved towards a wall that their kernel touches."""
+    low, high = inner[:, :1], inner[:, 1:]
+    return (((cells < low) & (cells < before - _STILL)) | ((cells > high) & (cells > before + _STILL))).any(0)
 
 
 def _respond(law, state, v, per_cell, dt, dx, parameters):

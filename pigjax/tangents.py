@@ -157,7 +157,7 @@ def _gradient(setting, scene, at, nodes):
 def _spread(setting, scene, at, state, affine, mass=None):
     """Windows of a chunk [c r k]: `mass`, and forces that grow linearly."""
     mass = jnp.zeros_like(state.volume[0]) if mass is None else mass
-    affine = jnp.broadcast_to(affine, (3, *state.v.shape))
+    affine = jnp.broadcast_to(jnp.asarray(affine, state.v.dtype), (3, *state.v.shape))
     polynomial = stage(scene.go, brought, at.distance, mass, jnp.zeros_like(state.v), affine)
     return spread(setting.kernel, scene.go, at, polynomial)
 

@@ -179,7 +179,10 @@ def test_a_whole_scene_leaves_video_pictures_states_and_report(finished):
     written = json.loads((out / "report.json").read_text())
     assert written["modelled"]["laws"] == ["fixed_corotated"]
     assert written["sizes"]["frames"] == 3
-    assert written["health"]["nonfinite"] == 0
+    assert written["health"]["nonfinite"] == written["health"]["unconverged"] == 0
+    assert written["health"]["first_bad_frame"] is None
+    assert len(written["health"]["kinetic_energy_J"]) == 4
+    assert written["sizes"]["particles_of"] == {"ball": written["sizes"]["particles"]}
     assert set(written["times"]) == {"read", "segment", "seed", "simulate", "draw"}
     assert all(spent["run_s"] >= 0 for spent in written["times"].values())
     for spent in written["times"].values():
@@ -241,7 +244,9 @@ def test_drawing_anew_simulates_nothing_and_another_scene_is_refused(finished, f
     report = run_scene(turned, out)
     assert (out / "video.mp4").exists()
     assert report.sizes["resumed_from_frame"] == 3
-    assert report.health == {}
+    first = json.loads((done / "report.json").read_text())
+    assert report.as_dict()["health"] == first["health"]
+    assert report.sizes["substeps_per_frame"] == first["sizes"]["substeps_per_frame"]
     with pytest.raises(InputError, match="belongs to another run"):
         run_scene(scene_from(values(simulation__dx=0.06), folder=folder), out)
 

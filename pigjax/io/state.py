@@ -37,15 +37,17 @@ def save_state(
     return path
 
 
-def load_state(folder: PathLike, frame: int, *, signature: str | None = None) -> dict[str, np.ndarray]:
-    """The arrays of one frame. Host.
+def load_state(
+    folder: PathLike, frame: int, *, signature: str | None = None, prefix: str = ""
+) -> dict[str, np.ndarray]:
+    """The arrays of one frame whose names begin with `prefix`; others are not read. Host.
 
     Raises:
         MissingFileError: the frame was not written.
         InputError: the file is damaged, or belongs to a run with another signature.
     """
     path = existing(_frame_path(folder, frame), "state file")
-    state = _read(path)
+    state = _read(path, prefix=prefix)
     _check_signature(path, state, signature)
     return {name: values for name, values in state.items() if name != _SIGNATURE}
 
@@ -63,7 +65,7 @@ def last_state(folder: PathLike, *, signature: str) -> int | None:
         if last is not None and frame != last + 1:
             break
         try:
-            state = _read(path, only_signature=True)
+            state = _read(path, prefix=_SIGNATURE)
         except InputError:
             break
         _check_signature(path, state, signature)
@@ -106,10 +108,11 @@ def _frame_path(folder: PathLike, frame: int) -> Path:
     return Path(folder) / f"{frame:06d}.npz"
 
 
-def _read(path: Path, *, only_signature: bool = False) -> dict[str, np.ndarray]:
+def _read(path: Path, *, prefix: str = "") -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in ([_SIGNATURE] if only_signature else archive.files)}
+            wanted = [name for name in archive.files if name.startswith(prefix) and name != _SIGNATURE]
+            return {name: archive[name] for name in [_SIGNATURE, *wanted]}
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: not a readable state file ({error}); delete it and run again.") from None
 

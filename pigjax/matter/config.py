@@ -11,13 +11,17 @@ from pigjax.errors import InputError
 from pigjax.matter.state import WALL
 from pigjax.transfers import KERNELS
 
-_WALLS = ("separate", "slip", "sticky")
+_WALLS = (None, "separate", "slip", "sticky")
 _INTEGRATORS = ("explicit", "implicit", "auto")
 _DIFFERENTIATION = ("reverse", "forward")
 
 
 class SimConfig(eqx.Module):
     """Every choice of the simulation that is compiled in.
+
+    The outer nodes of a grid are walls. Without `walls` they hold as "separate" does, and matter that moves into them
+    is counted (`Health.wall_hits`) and `rollout` warns of it, since there the grid ended and not the world. To name a
+    kind of wall says that it belongs to the scene: nothing is counted then.
 
     Raises:
         InputError: a choice does not exist or a number is out of range.
@@ -30,7 +34,8 @@ class SimConfig(eqx.Module):
     substeps: int | None = static_field(default=None, limits=Limits(1, 100_000_000))
     # share of a cell that waves and particles cross in a step
     cfl: float = static_field(default=0.4, limits=Limits(0, 1, above=True))
-    walls: str = static_field(default="separate", choices=_WALLS)  # of the domain: "separate", "slip" or "sticky"
+    # that the scene wants: "separate", "slip" or "sticky"; None: as "separate", and particles that meet it are counted
+    walls: str | None = static_field(default=None, choices=_WALLS)
     # bounds of F_visual's singular values
     visual_stretch: tuple[float, float] = static_field(default=(0.2, 5.0), limits=Limits(0, above=True))
     force: bool = static_field(default=False)  # run steps longer than the stable limit

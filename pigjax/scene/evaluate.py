@@ -66,7 +66,12 @@ def evaluate_files(
         lifted = _lift(gaussians, dataset, fill=fill, **settings)
     else:
         stored = io.load_labels(labels, len(gaussians))
-        lifted = Labels(*map(jnp.asarray, stored[:3]), ids=None if stored.ids is None else jnp.asarray(stored.ids))
+        lifted = Labels(
+            jnp.asarray(stored.object_id),
+            jnp.asarray(stored.votes),
+            jnp.asarray(stored.confidence),
+            ids=None if stored.ids is None else jnp.asarray(stored.ids),
+        )
         lifted = fill_unseen(gaussians, lifted) if fill else lifted
     progress("lift", 1, 1)
     cameras = {view: dataset.test.cameras[i] for i, view in enumerate(dataset.test.names)}

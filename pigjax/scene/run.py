@@ -18,10 +18,11 @@ from pigjax.arguments import checked
 from pigjax.boxes import Fit, devices_for
 from pigjax.camera import Camera
 from pigjax.errors import SimulationError
-from pigjax.matter import Health, Particles, fit_grid, vast_grid
-from pigjax.mls_mpm import choose_integrator, choose_substeps
+from pigjax.matter import Particles, vast_grid
+from pigjax.mls_mpm import first_substeps, frame_substeps
 from pigjax.overlay import id_image, legend_sheet, overlay
 from pigjax.particles import deform
+from pigjax.scene.health import MARK, Record, health_record, remarks, summary
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, render_config, segment, signature
 from pigjax.scene.report import RunReport
 from pigjax.scene.schema import Scene
@@ -86,7 +87,9 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress) -> None:
 
 def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: RunReport) -> None:
     names = {number: name for name, number in inputs.ids.items()}
-    object_id, counts = np.asarray(labels.object_id), dict(zip(plan.table.laws, plan.particles.counts))
+    object_id, counts = np.asarray(labels.object_id), plan.particles.counts
+    of_object = dict(zip((name for name, entry in scene.objects.items() if not entry.fixed), counts))
+    of_law = {law: sum(n for n, own in zip(counts, plan.table.laws) if own == law) for law in plan.table.laws}
     report.modelled |= {
         "accuracy": scene.accuracy,
         "laws": sorted(set(plan.table.laws)),
@@ -99,9 +102,10 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
     }
     report.sizes |= {
         "gaussians": len(inputs.gaussians),
-        "gaussians_of": {names.get(k, str(k)): int(np.sum(object_id == k)) for k in np.unique(object_id)},
+        "gaussians_of": {names.get(k, f"id {k}"): int(np.sum(object_id == k)) for k in np.unique(object_id)},
         "particles": len(plan.particles),
-        "particles_of_law": counts,
+        "particles_of": of_object,
+        "particles_of_law": of_law,
         "gaussians_without_particle": 0 if plan.binding is None else len(plan.binding),
         "frames": scene.simulation.frames,
         "mass_kg": float(plan.particles.mass.sum()),
@@ -115,22 +119,21 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
     checkpoint = folder / "last.ckpt"
     fit = Fit() if plan.sleep is None else Sleeper(settings=plan.sleep, body=np.asarray(particles.body))
     # the same for a run that goes on as for one from the start
-    domain, near = vast_grid(scene.simulation.dx), fit_grid(particles.x, scene.simulation.dx)
-    steps: dict[str, Any] = {"frames": max(frames, 1), "frame_dt": plan.frame_dt}
-    steps |= {"gravity": plan.gravity, "colliders": plan.colliders}
-    config = choose_integrator(particles, near, plan.table, plan.config, **steps)
-    substeps = choose_substeps(particles, near, plan.table, config, **steps)
+    domain = vast_grid(scene.simulation.dx)
+    steps: dict[str, Any] = {"frame_dt": plan.frame_dt, "gravity": plan.gravity, "colliders": plan.colliders}
+    config, first = first_substeps(particles, domain, plan.table, plan.config, frames=max(frames, 1), **steps)
     if done is None:
         done = 0
-        _save(folder, 0, particles, fit, key, checkpoint)
+        _save(folder, 0, particles, health_record(particles, None, plan.gravity), fit, key, checkpoint)
     elif done < frames:
         saved, particles, memory = io.load_pytree(checkpoint, (np.zeros((), np.int64), particles, fit.memory()))
         done = int(saved)
         fit.remember(memory)
-    worst: list[Health] = []
+    report.modelled["integrator"] = config.integrator
     dtype = particles.x.dtype
     for frame in range(done + 1, frames + 1):
         tell("simulate", frame - 1, frames)
+        substeps = frame_substeps(first, particles, domain, plan.table, config, frame=frame - 1, **steps)
         particles, _, health = fit.frame(
             particles,
             domain,
@@ -145,34 +148,37 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
             frames=1,
             substeps=substeps,
         )
-        worst.append(health)
-        if health.nonfinite > 0 or health.max_courant >= 1:
+        record = health_record(particles, health, plan.gravity)
+        if health.is_broken():
+            report.health |= summary(_records(folder, frame - 1, key) | {frame: record})
             raise SimulationError(
                 f"frame {frame} of {frames}: {', '.join(health.problems())}; states up to frame {frame - 1} are kept in"
                 f" {folder}. Lower simulation.cfl, or make matter softer or slower."
             )
-        _save(folder, frame, particles, fit, key, checkpoint)
+        _save(folder, frame, particles, record, fit, key, checkpoint)
     tell("simulate", frames, frames)
-    report.modelled["integrator"] = config.integrator
-    report.sizes |= {"substeps_per_frame": substeps, "last_grid": fit.shape, "resumed_from_frame": done}
+    records = _records(folder, frames, key)
+    most = max((int(record["substeps"]) for frame, record in records.items() if frame), default=first)
+    report.sizes |= {"substeps_per_frame": most, "last_grid": fit.shape, "resumed_from_frame": done}
+    report.health |= summary(records)
+    report.warnings += remarks(report.health, driven=any(collider.moves for collider in plan.colliders))
     if isinstance(fit, Sleeper):
         report.sizes["asleep_at_the_end"] = int(fit.asleep.sum())
-    if worst:
-        report.health |= {
-            "min_J": float(min(h.min_J for h in worst)),
-            "max_courant": float(max(h.max_courant for h in worst)),
-            "inverted_at_most": int(max(h.inverted for h in worst)),
-            "nonfinite": int(max(h.nonfinite for h in worst)),
-        }
-        if report.health["inverted_at_most"]:
-            report.warnings.append(
-                f"up to {report.health['inverted_at_most']} particles were turned inside out at one time;"
-                " stiffer matter or a finer simulation.dx would prevent it."
-            )
 
 
-def _save(folder: Path, frame: int, particles: Particles, fit: Fit, key: str, checkpoint: Path) -> None:
-    arrays = {"x": particles.x, "v": particles.v, "F_visual": particles.F_visual}
+def _records(folder: Path, frames: int, key: str) -> dict[int, Record]:
+    """What the states on disk hold of the health of each frame."""
+    records: dict[int, Record] = {}
+    for frame in range(frames + 1):
+        state = io.load_state(folder, frame, signature=key, prefix=MARK)
+        if state:
+            records[frame] = {name.removeprefix(MARK): values for name, values in state.items()}
+    return records
+
+
+def _save(folder: Path, frame: int, particles: Particles, record: Record, fit: Fit, key: str, checkpoint: Path) -> None:
+    arrays: dict[str, Any] = {"x": particles.x, "v": particles.v, "F_visual": particles.F_visual}
+    arrays |= {MARK + name: values for name, values in record.items()}
     io.save_state(folder, frame, {name: np.asarray(a) for name, a in arrays.items()}, signature=key)
     io.save_pytree(checkpoint, (np.asarray(frame), particles, fit.memory()))
 

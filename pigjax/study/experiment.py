@@ -31,7 +31,7 @@ from pigjax.contact import BodyContact
 from pigjax.errors import InputError, SceneError
 from pigjax.materials import Material, MaterialTable, Parameters
 from pigjax.matter import Grid, Health, Particles, Trajectory, fit_grid, vast_grid
-from pigjax.mls_mpm import SimConfig, choose_integrator, choose_substeps, rollout, stable_dt
+from pigjax.mls_mpm import SimConfig, first_substeps, rollout, stable_dt
 from pigjax.particles import Binding, at_frame, deform
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, render_config, segment
 from pigjax.scene.schema import Scene
@@ -249,8 +249,8 @@ def experiment(
     """Read a scene and make an experiment of it. Host.
 
     The substeps are those of the most demanding of `extremes`, and the grid holds the motion of the scene as it is and
-    of each of them. What goes further meets the domain's wall, and what is faster the edge of the box of the grid that
-    moves with matter (`SimConfig.box`): both are counted in `Health.escaped`.
+    of each of them. What goes further meets the domain's wall, counted in `Health.wall_hits`, and what is faster the
+    edge of the box of the grid that moves with matter (`SimConfig.box`), counted in `Health.escaped`.
 
     Args:
         scene: as `load_scene` gives it.
@@ -348,7 +348,6 @@ def _split_object(made: Experiment, name: str, count: int) -> Experiment:
 
 def _fitted(made: Experiment, dx: float, extremes: list[Mapping[str, Any]], margin: float) -> Experiment:
     """With substeps and a grid that serve all extremes."""
-    near = fit_grid(made.particles.x, dx)
     cases = [case for values in extremes if (case := made.with_parameters(values))._is_possible()]
 
     def steps(case: Experiment) -> dict[str, Any]:
@@ -359,14 +358,13 @@ def _fitted(made: Experiment, dx: float, extremes: list[Mapping[str, Any]], marg
             "colliders": case.colliders,
         }
 
-    config = choose_integrator(made.particles, near, made.table, made.config, **steps(made))
-    substeps = max(choose_substeps(case.particles, near, case.table, config, **steps(case)) for case in cases)
-    config = replace(config, substeps=substeps)
-    reached, runs = [np.asarray(made.particles.x)], []
+    config, _ = first_substeps(made.particles, made.grid, made.table, made.config, **steps(made))
+    reached, runs, substeps = [np.asarray(made.particles.x)], [], 1
     for case in cases:
-        trajectory = replace(case, config=config).simulate().trajectory
+        _, _, trajectory, health = replace(case, config=config).simulate()
+        substeps = max(substeps, int(health.substeps))
         reached.append(np.asarray(trajectory.x).reshape(-1, 3))
         runs.append((case.particles, trajectory, float(case.frame_dt), case.gravity))
     grid = fit_grid(np.concatenate(reached), dx, margin=margin)
     box = box_for(runs, made.table, grid)
-    return replace(made, config=replace(config, box=box), grid=grid)
+    return replace(made, config=replace(config, substeps=substeps, box=box), grid=grid)

@@ -164,7 +164,7 @@ def objective_of(function: str, options: dict[str, Any], folder: Path) -> Object
 
 def _healthy(objective: Objective, outcome: Outcome) -> Scores:
     health = outcome.health
-    broken = (health.nonfinite > 0) | (health.max_courant >= 1) | (health.escaped > 0)
+    broken = health.is_broken() | (health.wall_hits > 0)  # no scene of a study asks for the walls of its grid
     return {name: jnp.where(broken, jnp.nan, score) for name, score in _scores(objective, outcome).items()}
 
 

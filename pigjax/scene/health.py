@@ -1,0 +1,85 @@
+"""Health of a scene's simulation: a record for each frame, kept beside its state, and what they say together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+
+from pigjax.matter import Health, Particles
+
+Record: TypeAlias = dict[str, np.ndarray]  # numbers of one frame, by name
+MARK = "health_"  # what names of a record begin with in a state file
+_GAIN = 0.05  # energy that appears from nowhere, relative to the largest kinetic energy, beyond what steps round off
+_MOST = ("escaped", "inverted", "wall_hits")  # counts of what may recover: the most at one time
+
+
+def health_record(particles: Particles, health: Health | None, gravity: Float[np.ndarray, "3"]) -> Record:
+    """Health of a frame, None at the start, and the energy and momentum after it.
+
+    Energies are kinetic, and that of gravity from the world's origin; what matter stores by its stretches is not
+    among them.
+    """
+    numbers = () if health is None else fields(Health)
+    record = {field.name: np.asarray(getattr(health, field.name)) for field in numbers}
+    x, v, mass = (np.asarray(a, np.float64) for a in (particles.x, particles.v, particles.mass))
+    known = np.isfinite(x).all(1) & np.isfinite(v).all(1) & np.isfinite(mass)
+    x, v, mass = x[known], v[known], mass[known]
+    height = -(x * np.asarray(gravity, np.float64)).sum(1)  # times the strength of gravity [m²/s²]
+    return record | {
+        "kinetic_energy": np.asarray((mass * (v**2).sum(1)).sum() / 2),
+        "gravity_energy": np.asarray((mass * height).sum()),
+        "momentum": (mass[:, None] * v).sum(0),
+    }
+
+
+def summary(records: Mapping[int, Record]) -> dict[str, Any]:
+    """The worst of all frames, which are numbered from 1, and energies from the start on; empty without records."""
+    everything = [records[frame] for frame in sorted(records)]
+    rows = [records[frame] for frame in sorted(records) if frame > 0]
+    if not rows:
+        return {}
+    bad = [frame for frame in sorted(records) if frame > 0 and records[frame]["first_bad_frame"] >= 0]
+    energy = {name: [float(row[f"{name}_energy"]) for row in everything] for name in ("kinetic", "gravity")}
+    return {
+        "frames": len(rows),
+        "min_J": float(min(row["min_J"] for row in rows)),
+        "max_courant": float(max(row["max_courant"] for row in rows)),
+        "nonfinite": int(max(row["nonfinite"] for row in rows)),
+        "unconverged": int(sum(row["unconverged"] for row in rows)),
+        **{f"{name}_at_most": int(max(row[name] for row in rows)) for name in _MOST},
+        "first_bad_frame": bad[0] if bad else None,
+        "kinetic_energy_J": energy["kinetic"],
+        "gravity_energy_J": energy["gravity"],
+        "momentum_kg_m_s": [row["momentum"].tolist() for row in everything],
+    }
+
+
+def remarks(health: Mapping[str, Any], *, driven: bool) -> list[str]:
+    """What is wrong, in sentences that name a remedy; `driven` says that colliders move and may do work."""
+    if not health:
+        return []
+    found = []
+    if count := health["inverted_at_most"]:
+        found.append(
+            f"up to {count} particles were turned inside out at one time; stiffer matter or a finer simulation.dx would"
+            " prevent it."
+        )
+    if count := health["unconverged"]:
+        found.append(
+            f"{count} implicit step{'s' * (count != 1)} did not converge; lower simulation.cfl, or take"
+            ' simulation.integrator = "explicit".'
+        )
+    if count := health["wall_hits_at_most"]:
+        found.append(f"up to {count} particles met the wall of the grid at one time, where they are held back.")
+    total = np.add(health["kinetic_energy_J"], health["gravity_energy_J"])
+    scale = max(health["kinetic_energy_J"])
+    if not driven and (gain := float(np.max(total - total[0]))) > _GAIN * scale and gain > 0:
+        found.append(
+            f"kinetic energy and that of gravity grew by {gain:.2g} J together, though nothing drives the matter; lower"
+            " simulation.cfl."
+        )
+    return found
