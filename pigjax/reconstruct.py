@@ -6,9 +6,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -19,7 +20,7 @@ from pigjax import io
 from pigjax.arguments import checked
 from pigjax.bands import replicate
 from pigjax.camera import Camera
-from pigjax.errors import InputError
+from pigjax.errors import InputError, StaleError
 from pigjax.extent import scene_extent
 from pigjax.fitting import (
     FitConfig,
@@ -80,6 +81,7 @@ def reconstruct(
     checkpoint: Path | None = None,
     previews: Path | None = None,
     callback: Callable[[Progress], None] | None = None,
+    overwrite: bool = False,
 ) -> Reconstruction:
     """Fit Gaussians to the training views, and score the held-out ones (split "test"). Host.
 
@@ -92,8 +94,10 @@ def reconstruct(
         previews: folder for a picture of the first held-out (or else training) view beside its photo, every
             `config.preview_every` steps.
         callback: told the progress every few dozen steps.
+        overwrite: begin anew where the checkpoint was made from something else, instead of refusing it.
 
     Raises:
+        StaleError: the checkpoint was made from other photos, cameras, masks, points or settings; it names which.
         InputError: no training views, too few points, or no masks where the settings need them.
     """
     # the capacity of a picture would drop splats without a word
@@ -113,9 +117,10 @@ def reconstruct(
         zero = jnp.zeros((), jnp.int32)
         return FitState(gaussians, optimizers[0].init(gaussians), poses, optimizers[1].init(poses), zero, zero)
 
+    parts = provenance(views, config, points)
     state = start(count_at(0, config))
     if checkpoint is not None and checkpoint.exists():
-        state = _resume(checkpoint, start, config)
+        state = _resume(checkpoint, start, config, parts, overwrite)
     photos = _photos(train, config)
     if photos.mattes is not None and not photos.mattes.any():
         raise InputError(f"{_asked(config)}: no mask of the training views has any pixel of it.")
@@ -136,7 +141,7 @@ def reconstruct(
         if stop % config.evaluate_every == 0 or stop == config.steps:
             psnrs, ssims = _score(state.gaussians, scored, config)
             if checkpoint is not None:
-                io.save_pytree(checkpoint, state)
+                io.save_pytree(checkpoint, state, parts=parts)
         if previews is not None and config.preview_every and stop % config.preview_every == 0:
             _preview(previews / f"{stop:06d}.png", state.gaussians, held_out or train, config)
         spent = time.perf_counter() - begun
@@ -188,15 +193,46 @@ def _scored(views: io.Views, config: FitConfig) -> tuple[tuple[str, ...], Camera
     return tuple(views.names[k] for k in seen), views.cameras[seen], images[seen]
 
 
-def _resume(checkpoint: Path, start: Callable[[int], FitState], config: FitConfig) -> FitState:
-    """State of a checkpoint, whose number of splats is one of those that the settings pass through."""
-    counts = {count_at(step, config) for step in range(0, config.steps + 1, config.grow_every)}
-    for count in sorted(counts - {config.splats}):
+def provenance(views: io.Views, config: FitConfig, points: Any) -> dict[str, str]:
+    """Parts that a reconstruction depends on, by content.
+
+    How often previews are drawn and how many devices share an image do not count.
+    """
+    settings = replace(config, preview_every=0, render=replace(config.render, bands=1))
+    return io.parts_of(
+        {
+            "settings": settings,
+            "photos": io.digest(views.images, views.names, views.splits),
+            "cameras": io.digest(jax.tree.leaves(views.cameras), views.cameras.width, views.cameras.height),
+            "masks": io.digest(views.masks),
+            "points": io.digest(points),
+            "precision": str(jnp.result_type(float)),
+        }
+    )
+
+
+def _resume(
+    checkpoint: Path, start: Callable[[int], FitState], config: FitConfig, parts: dict[str, str], overwrite: bool
+) -> FitState:
+    """State of a checkpoint, whose number of splats is one of those that the settings pass through.
+
+    The state at the beginning where it is damaged, or made from something else that may be overwritten.
+    """
+    counts = sorted({count_at(step, config) for step in range(0, config.steps + 1, config.grow_every)})
+    damage: InputError | None = None
+    for count in dict.fromkeys([*counts, config.splats]):
         try:
-            return io.load_pytree(checkpoint, start(count))
-        except InputError:
-            continue
-    return io.load_pytree(checkpoint, start(config.splats))
+            return io.load_pytree(checkpoint, start(count), parts=parts)
+        except StaleError:
+            if not overwrite:
+                raise
+            break
+        except InputError as error:
+            damage = error
+    else:
+        assert damage is not None
+        io.set_aside(checkpoint, damage)
+    return start(count_at(0, config))
 
 
 def _preview(path: Path, gaussians: Gaussians, views: io.Views, config: FitConfig) -> None:

@@ -19,6 +19,9 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 # names come from files: nothing that is printed is taken for markup, a style is given by `said`
 console = Console(stderr=True, markup=False, emoji=False, highlight=False)
 _MOST_DEVICES = 8  # an image has too few rows of tiles for more
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace results of other settings or files instead of refusing them.")
+]
 DropInvalid = Annotated[
     bool, typer.Option("--drop-invalid", help="Leave out Gaussians that hold NaN or infinity, with a warning.")
 ]

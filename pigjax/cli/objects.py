@@ -10,7 +10,19 @@ import typer
 from rich.progress import TaskID
 from rich.table import Table
 
-from pigjax.cli.base import DropInvalid, Origin, Out, app, console, one_device_per_core, progress, row, said
+from pigjax.cli.base import (
+    DropInvalid,
+    Origin,
+    Out,
+    Overwrite,
+    app,
+    console,
+    one_device_per_core,
+    output_path,
+    progress,
+    row,
+    said,
+)
 
 TauT = Annotated[float, typer.Option(help="Transmittance that marks the surface.", min=0, max=1)]
 TauD = Annotated[float, typer.Option(help="Relative depth tolerance of a vote.", min=0, max=1)]
@@ -25,7 +37,17 @@ Fill = Annotated[bool, typer.Option(help="Give unseen Gaussians the id of their 
 @app.command()
 def reconstruct(
     views: Annotated[Path, typer.Argument(help="transforms.json, cameras.json, COLMAP model, or their folder.")],
-    out: Out = Path("reconstruction"),
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder for the results; reconstruction-NAME of the photos' folder if not given.",
+            parser=str,
+            callback=lambda path: None if path is None else output_path(path),
+            metavar="PATH",
+        ),
+    ] = None,
     steps: Annotated[int, typer.Option(help="Optimisation steps.", min=1)] = 3000,
     splats: Annotated[int, typer.Option(help="Number of Gaussians.", min=4)] = 15_000,
     sh_degree: Annotated[int, typer.Option(help="Bands of view-dependent colour.", min=0, max=3)] = 1,
@@ -40,6 +62,7 @@ def reconstruct(
     previews: Annotated[int, typer.Option(help="Steps between preview pictures; 0 for none.", min=0)] = 0,
     seed: int = 0,
     origin: Origin = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Fit Gaussians to photos; writes OUT/gaussians.ply, and goes on from OUT/checkpoint if it was stopped."""
     one_device_per_core()
@@ -68,6 +91,8 @@ def reconstruct(
         seed=seed,
         render=RenderConfig(bands=jax.local_device_count()),
     )
+    if out is None:
+        out = Path(f"reconstruction-{_name_of(views)}")
     out = io.output_folder(out, files=("gaussians.ply", "poses.json", "report.json"), folders=("previews",))
     with progress("{task.fields[state]}") as bar:
         task, last = bar.add_task("reconstruct", total=steps, state=""), [""]
@@ -77,7 +102,13 @@ def reconstruct(
             bar.update(task, completed=step.step, state=f"loss {step.loss:.4f}{last[0]}")
 
         result = reconstruct(
-            loaded, config, points=points, checkpoint=out / "checkpoint", previews=out / "previews", callback=tell
+            loaded,
+            config,
+            points=points,
+            checkpoint=out / "checkpoint",
+            previews=out / "previews",
+            callback=tell,
+            overwrite=overwrite,
         )
     ply = out / "gaussians.ply"
     io.save_ply(ply, result.gaussians, origin=origin)
@@ -91,6 +122,15 @@ def reconstruct(
         table.add_row(*row(name, f"{result.psnr[name]:.2f}", f"{result.ssim[name]:.4f}"))
     console.print(table)
     console.print(said(f"mean PSNR {result.mean_psnr:.2f} dB, SSIM {result.mean_ssim:.4f}; {out / 'gaussians.ply'}"))
+
+
+def _name_of(views: Path) -> str:
+    """Name of the folder of a capture, by which its results are told from those of others."""
+    from pigjax import io
+
+    home = views.resolve() if views.is_dir() else views.resolve().parent
+    generic = ("sparse", "0", "colmap", "images")
+    return io.safe_name(next((part for part in reversed(home.parts) if part not in generic), "photos"))
 
 
 def _settings(tau_t: float, tau_d: float, weighting: str, purity: float, min_seen: float | None) -> dict[str, Any]:
@@ -116,6 +156,7 @@ def segment(
     remove: Annotated[list[str] | None, typer.Option(help="Object to leave out, by name or id; repeat it.")] = None,
     drop_invalid: DropInvalid = False,
     origin: Origin = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Lift masks to the Gaussians; writes labels, one .ply per object, and a sheet that shows which id is which.
 
@@ -128,7 +169,9 @@ def segment(
     loaded = io.load_views(views, masks=masks if masks is not None else True, origin=origin)
     known = {} if names is None else io.load_names(names)
     settings = _settings(tau_t, tau_d, weighting, purity, min_seen)
-    counts = segment_files(cloud, loaded, known, out, fill=fill, remove=remove or (), origin=origin, **settings)
+    counts = segment_files(
+        cloud, loaded, known, out, fill=fill, remove=remove or (), origin=origin, overwrite=overwrite, **settings
+    )
     table = Table("id", "object", "Gaussians")
     for number, count in counts.items():
         table.add_row(*row(number, known.get(number, "never seen" if number < 0 else ""), count))
@@ -155,6 +198,7 @@ def evaluate(
     holes: Annotated[int, typer.Option(help="Close holes of up to this many pixels in the masks.", min=0)] = 0,
     max_size: Annotated[int | None, typer.Option(help="Shrink photos to this many pixels.")] = None,
     drop_invalid: DropInvalid = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Score objects against true masks (mIoU, mBIoU); writes OUT/scores.json and OUT/sheet.png."""
     from pigjax import io
@@ -172,7 +216,7 @@ def evaluate(
 
         report = evaluate_files(
             cloud, read, out, labels=labels, prompts=prompts, reference=reference,
-            fill=fill, progress=tell, **_settings(tau_t, tau_d, weighting, purity, min_seen),
+            fill=fill, progress=tell, overwrite=overwrite, **_settings(tau_t, tau_d, weighting, purity, min_seen),
         )  # fmt: skip
     scores = report.evaluation.scores
     table = Table("prompt", "object", "views", *(f"{level} mIoU / mBIoU %" for level in scores))

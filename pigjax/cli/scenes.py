@@ -15,6 +15,7 @@ from pigjax.cli.base import (
     DropInvalid,
     Origin,
     Out,
+    Overwrite,
     app,
     console,
     one_device_per_core,
@@ -47,9 +48,9 @@ def example_folder() -> Path:
 
 
 @app.command()
-def demo(out: Out = Path("pigjax-demo"), accuracy: AccuracyOption = None) -> None:
+def demo(out: Out = Path("pigjax-demo"), accuracy: AccuracyOption = None, overwrite: Overwrite = False) -> None:
     """Simulate the bundled tabletop scene and leave a video."""
-    _run(example_folder() / "scene.toml", out, accuracy)
+    _run(example_folder() / "scene.toml", out, accuracy, overwrite=overwrite)
 
 
 @app.command()
@@ -58,12 +59,13 @@ def run(
     out: Out = Path("out"),
     accuracy: AccuracyOption = None,
     drop_invalid: DropInvalid = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Simulate a scene and draw its video; a killed run goes on from its last frame."""
-    _run(scene, out, accuracy, drop_invalid=drop_invalid)
+    _run(scene, out, accuracy, drop_invalid=drop_invalid, overwrite=overwrite)
 
 
-def _run(path: Path, out: Path, accuracy: str | None, *, drop_invalid: bool = False) -> None:
+def _run(path: Path, out: Path, accuracy: str | None, *, drop_invalid: bool = False, overwrite: bool = False) -> None:
     one_device_per_core()
     from pigjax.scene import load_scene, run_scene
 
@@ -81,7 +83,7 @@ def _run(path: Path, out: Path, accuracy: str | None, *, drop_invalid: bool = Fa
                 tasks[stage] = bar.add_task(stage, total=of)
             bar.update(tasks[stage], completed=done, total=of)
 
-        report = run_scene(scene, out, progress=tell)
+        report = run_scene(scene, out, progress=tell, overwrite=overwrite)
     table = Table("stage", "run s", "compile s")
     for name, spent in report.times.items():
         table.add_row(*row(name, f"{spent.run:.1f}", f"{spent.compile:.1f}"))

@@ -10,7 +10,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from pigjax.cli.base import Out, app, console, one_device_per_core, progress, row, said
+from pigjax.cli.base import Out, Overwrite, app, console, one_device_per_core, progress, row, said
 
 
 @app.command()
@@ -20,6 +20,7 @@ def sweep(
     coordinator: Annotated[str | None, typer.Option(help="HOST:PORT of process 0, for several processes.")] = None,
     processes: Annotated[int, typer.Option(help="How many processes take part.", min=1)] = 1,
     process: Annotated[int, typer.Option(help="Number of this one, from 0.", min=0)] = 0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Score every set of parameters of a study: OUT/table.csv, a plot, and the best as a scene; goes on if stopped."""
     one_device_per_core()
@@ -30,7 +31,9 @@ def sweep(
     loaded = load_study(study)
     with progress() as bar:
         task = bar.add_task("sweep", total=None)
-        table = sweep_study(loaded, out, progress=lambda done, of: bar.update(task, completed=done, total=of))
+        table = sweep_study(
+            loaded, out, overwrite=overwrite, progress=lambda done, of: bar.update(task, completed=done, total=of)
+        )
     name, mode = loaded.sweep.of, loaded.sweep.best
     best = table.best_row(name, mode=mode)
     columns = (*loaded.parameters, name)
@@ -57,6 +60,7 @@ def tune(
     study: Annotated[Path, typer.Argument(help="Study file (.toml).")],
     out: Out = Path("tune"),
     method: Annotated[str | None, typer.Option(help="adam or cma, instead of what the study says.")] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Find the parameters of least loss: OUT/history.png, and the best as a scene OUT/best.toml; goes on if stopped."""
     one_device_per_core()
@@ -66,7 +70,10 @@ def tune(
     with progress("{task.fields[state]}") as bar:
         task = bar.add_task("tune", total=loaded.tune.steps, state="")
         best, history = tune_study(
-            loaded, out, progress=lambda done, of, said: bar.update(task, completed=done, total=of, state=said)
+            loaded,
+            out,
+            overwrite=overwrite,
+            progress=lambda done, of, said: bar.update(task, completed=done, total=of, state=said),
         )
     table = Table("parameter", "value")
     for name, value in best.items():

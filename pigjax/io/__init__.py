@@ -29,7 +29,17 @@ from pigjax.io.images import contact_sheet, read_image, write_image
 from pigjax.io.labels import StoredLabels, load_labels, save_labels
 from pigjax.io.masks import load_masks, save_masks
 from pigjax.io.ply import load_ply, load_points, read_ply, save_ply
-from pigjax.io.state import last_state, load_pytree, load_state, save_pytree, save_state
+from pigjax.io.provenance import check_same, claim, digest, file_digest, parts_of
+from pigjax.io.state import (
+    last_state,
+    load_pytree,
+    load_state,
+    readable_states,
+    resumed,
+    save_pytree,
+    save_state,
+    set_aside,
+)
 from pigjax.io.video import read_video, write_video
 
 __all__ = [
@@ -37,8 +47,12 @@ __all__ = [
     "Dataset",
     "StoredLabels",
     "Views",
+    "check_same",
+    "claim",
     "contact_sheet",
     "decoding",
+    "digest",
+    "file_digest",
     "id_named",
     "last_state",
     "load_array",
@@ -56,6 +70,7 @@ __all__ = [
     "load_views",
     "origin_of",
     "output_folder",
+    "parts_of",
     "plain_label",
     "read_gaussians",
     "read_image",
@@ -63,7 +78,9 @@ __all__ = [
     "read_ply",
     "read_toml",
     "read_video",
+    "readable_states",
     "remove",
+    "resumed",
     "safe_name",
     "safe_names",
     "save_arrays",
@@ -73,6 +90,7 @@ __all__ = [
     "save_ply",
     "save_pytree",
     "save_state",
+    "set_aside",
     "write_csv",
     "write_image",
     "write_json",

@@ -30,18 +30,19 @@ class ArrayHeader(NamedTuple):
     dtype: np.dtype
 
 
-def save_arrays(path: PathLike, arrays: Mapping[str, Any]) -> None:
-    """Write named arrays as a compressed `.npz` that `numpy.load` reads, whole or not at all. Host.
+def save_arrays(path: PathLike, arrays: Mapping[str, Any], *, compress: bool = True) -> None:
+    """Write named arrays as a `.npz` that `numpy.load` reads, whole or not at all. Host.
 
     Args:
         path: of the file.
         arrays: of numbers, truth values or texts, of any shape, by any names.
+        compress: smaller files; off where they are written often.
 
     Raises:
         InputError: an array holds Python objects, or the file cannot be written.
     """
     room = io.BytesIO()  # a disk that fills up meets one write of bytes
-    with zipfile.ZipFile(room, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(room, "w", zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED) as archive:
         for name, values in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                 try:
@@ -55,7 +56,12 @@ def save_arrays(path: PathLike, arrays: Mapping[str, Any]) -> None:
 
 
 def load_arrays(
-    path: PathLike, what: str, *, remedy: str, check: Callable[[Mapping[str, ArrayHeader]], None] | None = None
+    path: PathLike,
+    what: str,
+    *,
+    remedy: str,
+    check: Callable[[Mapping[str, ArrayHeader]], None] | None = None,
+    prefixes: tuple[str, ...] = ("",),
 ) -> dict[str, np.ndarray]:
     """Arrays of a `.npz` by name. Nothing in the file is run, and no memory is asked for that the file does not fill.
 
@@ -64,6 +70,7 @@ def load_arrays(
         what: the kind of file, for messages: "table".
         remedy: what the reader of a message can do.
         check: told {name: ArrayHeader} before any array is read; what it raises comes through.
+        prefixes: arrays whose names begin with none of these are not read.
 
     Raises:
         MissingFileError: there is no such file.
@@ -76,6 +83,8 @@ def load_arrays(
             check(headers)
         arrays = {}
         for info in archive.infolist():
+            if not info.filename.startswith(prefixes):
+                continue
             with archive.open(info) as file:
                 arrays[info.filename.removesuffix(".npy")] = np.lib.format.read_array(file, allow_pickle=False)
                 file.read()  # to the end, where the checksum is compared

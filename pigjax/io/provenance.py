@@ -12,6 +12,7 @@ import functools
 import hashlib
 import inspect
 import os
+import re
 import sys
 import sysconfig
 import types
@@ -29,6 +30,7 @@ from pigjax.io.files import PathLike, decoding, output_folder, read_json, remove
 Parts = Mapping[str, str]
 FORMAT = "1"  # of states, rows and checkpoints: another one means that they cannot be used again
 FILE = "provenance.json"
+_DIGEST = re.compile(r"#.*|'[0-9a-f]{16}'")  # a value that says nothing to a reader
 _LONGEST_SHOWN = 60  # characters of a value that is kept as it is
 _OF_LIBRARIES = ("site-packages", "dist-packages", sysconfig.get_paths()["stdlib"], str(Path(__file__).parents[1]))
 
@@ -147,7 +149,7 @@ def _recorded(file: Path) -> dict[str, str] | None:
 def _change(name: str, old: str | None, new: str | None) -> str:
     if old is None or new is None:
         return f"{name} ({'new' if old is None else 'gone'})"
-    shown = not any(value.startswith("#") for value in (old, new))
+    shown = not any(_DIGEST.fullmatch(value) for value in (old, new))
     return f"{name} ({old} -> {new})" if shown else name
 
 

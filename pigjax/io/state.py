@@ -1,8 +1,15 @@
-"""State on disk: one `.npz` per frame, and checkpoints of any pytree, none of which is ever torn."""
+"""State on disk: one `.npz` per frame, and checkpoints of any pytree, none of which is ever torn.
+
+A checkpoint is a line of JSON (parts of its provenance, SHA-256 of the rest) and the leaves as equinox writes them.
+"""
 
 from __future__ import annotations
 
-import zipfile
+import hashlib
+import io
+import json
+import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,8 +18,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Shaped
 
-from pigjax.errors import InputError
-from pigjax.io.files import PathLike, existing, writing
+from pigjax.errors import InputError, StaleError
+from pigjax.io.archives import load_arrays, save_arrays
+from pigjax.io.files import PathLike, decoding, existing, writing
+from pigjax.io.provenance import Parts, check_same
 
 _SIGNATURE = "signature"
 Tree = TypeVar("Tree")
@@ -31,9 +40,7 @@ def save_state(
     path = _frame_path(folder, frame)
     if _SIGNATURE in arrays:
         raise InputError(f"{path}: an array is named {_SIGNATURE!r}, which is taken; give it another name.")
-    contents: dict[str, Any] = {_SIGNATURE: signature, **arrays}
-    with writing(path) as partial:
-        np.savez(partial, **contents)
+    save_arrays(path, {_SIGNATURE: np.asarray(signature), **arrays}, compress=False)
     return path
 
 
@@ -44,7 +51,8 @@ def load_state(
 
     Raises:
         MissingFileError: the frame was not written.
-        InputError: the file is damaged, or belongs to a run with another signature.
+        StaleError: it belongs to a run with another signature.
+        InputError: the file is damaged.
     """
     path = existing(_frame_path(folder, frame), "state file")
     state = _read(path, prefix=prefix)
@@ -56,7 +64,7 @@ def last_state(folder: PathLike, *, signature: str) -> int | None:
     """The last frame that state on disk reaches from the first one without a gap; None if there is none. Host.
 
     Raises:
-        InputError: the state belongs to a run with another signature.
+        StaleError: a state belongs to a run with another signature.
     """
     frames = sorted(int(path.stem) for path in Path(folder).glob("*.npz") if path.stem.isdecimal())
     last = None
@@ -73,35 +81,107 @@ def last_state(folder: PathLike, *, signature: str) -> int | None:
     return last
 
 
-def save_pytree(path: PathLike, tree: Any) -> None:
-    """Write the leaves of a pytree, whole or not at all. Host.
+def readable_states(folder: PathLike, *, signature: str) -> set[int]:
+    """Frames whose states are whole, with a warning for each file that is damaged. Host.
+
+    Every array is read and compared with its checksum.
+
+    Raises:
+        StaleError: a state belongs to a run with another signature.
+    """
+    frames = set()
+    for path in sorted(Path(folder).glob("*.npz")):
+        if not path.stem.isdecimal():
+            continue
+        try:
+            _check_signature(path, _read(path), signature)
+        except StaleError:
+            raise
+        except InputError as error:
+            warnings.warn(f"{error} It is made again.", stacklevel=2)
+            continue
+        frames.add(int(path.stem))
+    return frames
+
+
+def save_pytree(path: PathLike, tree: Any, *, parts: Parts | None = None) -> None:
+    """Write the leaves of a pytree, whole or not at all, with a checksum. Host.
+
+    Args:
+        path: of the file.
+        tree: arrays and numbers.
+        parts: of `provenance.parts_of`, what the leaves were made from; None: they depend on nothing.
 
     Raises:
         InputError: the file cannot be written.
     """
-    with writing(path) as partial, partial.open("wb") as file:
-        eqx.tree_serialise_leaves(file, tree)
+    room = io.BytesIO()  # a disk that fills up meets one write of bytes
+    eqx.tree_serialise_leaves(room, tree)
+    payload = room.getvalue()
+    head = {"sha256": hashlib.sha256(payload).hexdigest(), "parts": dict(parts or {})}
+    with writing(path) as partial:
+        partial.write_bytes(json.dumps(head).encode() + b"\n" + payload)
 
 
-def load_pytree(path: PathLike, like: Tree) -> Tree:
+def load_pytree(path: PathLike, like: Tree, *, parts: Parts | None = None) -> Tree:
     """A pytree of the structure, shapes and types of `like`, with the leaves of a file of `save_pytree`. Host.
 
     Raises:
         MissingFileError: there is no such file.
+        StaleError: its leaves were made from other parts.
         InputError: the file is damaged, or its leaves are not those of `like`.
     """
     path = existing(path, "checkpoint")
+    with decoding(path, "checkpoint", remedy="delete it, and what it kept is computed again"):
+        head, _, payload = path.read_bytes().partition(b"\n")
+        told = json.loads(head)
+        found = {str(name): str(value) for name, value in told["parts"].items()}
+        if told["sha256"] != hashlib.sha256(payload).hexdigest():
+            raise ValueError("its checksum differs")
+    if parts is not None:
+        check_same(path, found, parts)
+    with decoding(path, "checkpoint", remedy="use the settings it was written with, or delete it"):
+        file = io.BytesIO(payload)
+        tree = eqx.tree_deserialise_leaves(file, like)
+        if file.read(1):
+            raise ValueError("it holds more leaves")
+        return tree
+
+
+def resumed(path: PathLike, like: Tree, *, parts: Parts, overwrite: bool = False) -> Tree | None:
+    """What a checkpoint holds; None where there is none, or where it is damaged, so that all is computed again. Host.
+
+    A damaged file is told in a warning and moved aside, to the same name with ".damaged".
+
+    Args:
+        path: of the checkpoint.
+        like: as for `load_pytree`.
+        parts: what a checkpoint must have been made from.
+        overwrite: take a checkpoint of other parts for none instead of refusing it.
+
+    Raises:
+        StaleError: it was made from other parts.
+    """
+    if not Path(path).is_file():
+        return None
     try:
-        with path.open("rb") as file:
-            tree = eqx.tree_deserialise_leaves(file, like)
-            if file.read(1):
-                raise ValueError("it holds more leaves")
-    except (RuntimeError, ValueError, EOFError, OSError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(
-            f"{path}: does not fit the present settings ({reason}); use the settings it was written with, or delete it."
-        ) from None
-    return tree
+        return load_pytree(path, like, parts=parts)
+    except StaleError:
+        if not overwrite:
+            raise
+        return None
+    except InputError as error:
+        set_aside(path, error)
+        return None
+
+
+def set_aside(path: PathLike, error: InputError) -> None:
+    """Move a damaged file out of the way, and warn."""
+    path = Path(path)
+    aside = path.with_name(path.name + ".damaged")
+    warnings.warn(f"{error} It is kept as {aside.name}, and what it held is computed again.", stacklevel=3)
+    with writing(aside) as partial:
+        os.replace(path, partial)
 
 
 def _frame_path(folder: PathLike, frame: int) -> Path:
@@ -109,18 +189,16 @@ def _frame_path(folder: PathLike, frame: int) -> Path:
 
 
 def _read(path: Path, *, prefix: str = "") -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            wanted = [name for name in archive.files if name.startswith(prefix) and name != _SIGNATURE]
-            return {name: archive[name] for name in [_SIGNATURE, *wanted]}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: not a readable state file ({error}); delete it and run again.") from None
+    state = load_arrays(path, "state file", remedy="delete it, and it is made again", prefixes=(prefix, _SIGNATURE))
+    if _SIGNATURE not in state:
+        raise InputError(f"{path}: no state file (it has no {_SIGNATURE}); delete it, and it is made again.")
+    return state
 
 
 def _check_signature(path: Path, state: Mapping[str, np.ndarray], signature: str | None) -> None:
     found = str(state.get(_SIGNATURE))
     if signature is not None and found != signature:
-        raise InputError(
+        raise StaleError(
             f"{path}: belongs to another run (signature {found}, this run has {signature});"
             " choose an empty output folder, or delete this one."
         )

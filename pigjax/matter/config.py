@@ -11,7 +11,7 @@ from pigjax.errors import InputError
 from pigjax.matter.state import WALL
 from pigjax.transfers import KERNELS
 
-_WALLS = (None, "separate", "slip", "sticky")
+_WALLS = ("separate", "slip", "sticky")
 _INTEGRATORS = ("explicit", "implicit", "auto")
 _DIFFERENTIATION = ("reverse", "forward")
 

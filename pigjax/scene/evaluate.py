@@ -40,6 +40,7 @@ def evaluate_files(
     reference: str | None = None,
     fill: bool = True,
     progress: Callable[[str, int, int], None] = lambda stage, done, of: None,
+    overwrite: bool = False,
     **settings: Any,
 ) -> Report:
     """Score labelled Gaussians on a data set; writes `scores.json` and `sheet.png` into `out`. Host.
@@ -55,12 +56,24 @@ def evaluate_files(
             prompts.
         fill: give Gaussians that no view saw the id of their neighbours.
         progress: called with the stage, steps done and of all.
+        overwrite: replace scores of something else in `out`, instead of refusing them.
         settings: of `lift_masks`.
 
     Raises:
+        StaleError: `out` holds scores of other Gaussians, another data set or other settings; it names what changed.
         InputError: files that do not fit each other, or cannot be written.
     """
     out = io.output_folder(out, files=("scores.json", "sheet.png"))
+    parts = io.parts_of(
+        {
+            "Gaussians": io.digest(gaussians),
+            "data set": io.digest(dataset),
+            "labels": "lifted" if labels is None else io.file_digest(labels),
+            "prompts": "none" if prompts is None else io.file_digest(prompts),
+            "": {**settings, "reference": reference, "fill": fill},
+        }
+    )
+    io.claim(out, parts, results=("scores.json", "sheet.png"), overwrite=overwrite)
     progress("lift", 0, 1)
     if labels is None:
         lifted = _lift(gaussians, dataset, fill=fill, **settings)

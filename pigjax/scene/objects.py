@@ -39,6 +39,7 @@ def segment_files(
     fill: bool,
     remove: Sequence[str] = (),
     origin: tuple[float, float, float] | None = None,
+    overwrite: bool = False,
     **settings: Any,
 ) -> dict[int, int]:
     """Lift masks and write `labels.npz`, `objects/<id>_<name>.ply`, `coloured.ply` and `objects.png`. Host.
@@ -56,17 +57,31 @@ def segment_files(
         fill: give unseen Gaussians the id of their neighbours.
         remove: names or ids of objects.
         origin: what was subtracted from the scene's positions [m]; the files get it back. None: nothing.
+        overwrite: remove what `out` holds of other Gaussians, views, masks, names or settings, instead of refusing it.
         settings: of `lift_masks`.
 
     Returns:
         Gaussians of each id.
 
     Raises:
+        StaleError: `out` holds results of something else; it names what changed.
         InputError: masks that do not fit the views, files that cannot be written, or an unknown object.
     """
     doomed = [_id_of(name, names) for name in remove]
     folders = ("objects", "removed") if doomed else ("objects",)
     out = io.output_folder(out, files=("labels.npz", "coloured.ply", "objects.png"), folders=folders)
+    parts = io.parts_of(
+        {
+            "Gaussians": io.digest(gaussians),
+            "cameras": io.digest(views.cameras),
+            "photos": io.digest(views.images, views.names, views.splits),
+            "masks": io.digest(views.masks),
+            "names": io.digest(names),
+            "": {**settings, "fill": fill, "origin": origin},
+        }
+    )
+    results = ("labels.npz", "coloured.ply", "objects.png", "objects", "removed")
+    io.claim(out, parts, results=results, overwrite=overwrite)
     io.output_folder(out / "objects")
     train = views.subset("train") if "train" in views.splits else views
     assert train.masks is not None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import warnings
 from dataclasses import dataclass, replace
 from typing import Any
@@ -313,14 +312,24 @@ def _camera_of_view(spec: CameraSpec, inputs: Inputs) -> Camera:
     return inputs.views.cameras[inputs.views.names.index(spec.view)]
 
 
-def signature(scene: Scene) -> str:
-    """Hash of all that the simulated states depend on; the camera, the clamp and the video do not count.
+def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
+    """Parts that the simulated states depend on; the camera, the clamp and the video do not count.
 
-    Nor does the name of the accuracy, but what it set.
+    Nor does the name of the accuracy, but what it set; files count by their content.
     """
     settings: dict[str, Any] = msgspec.to_builtins(scene)
     for name in ("accuracy", "camera", "clamp", "drawing", "folder"):
         settings.pop(name)
-    digest = hashlib.sha256(msgspec.json.encode(settings))
-    digest.update(scene.path(scene.input.gaussians).read_bytes())
-    return digest.hexdigest()[:16]
+    for name in ("gaussians", "views", "masks", "names"):
+        settings["input"].pop(name)
+    views = inputs.views
+    content = {
+        "Gaussians": jax.tree.leaves(inputs.gaussians),
+        "cameras": None if views is None else jax.tree.leaves(views.cameras),
+        "photos": None if views is None else (views.images, views.names, views.splits),
+        "masks": None if views is None else views.masks,
+        "ids of the objects": inputs.ids,
+        "precision": str(jnp.result_type(float)),
+    }
+    digested = {name: value if isinstance(value, str) else io.digest(value) for name, value in content.items()}
+    return io.parts_of({"": settings, "input files": digested})

@@ -17,13 +17,13 @@ from pigjax import io
 from pigjax.arguments import checked
 from pigjax.boxes import Fit, devices_for
 from pigjax.camera import Camera
-from pigjax.errors import SimulationError
+from pigjax.errors import SimulationError, StaleError
 from pigjax.matter import Particles, vast_grid
 from pigjax.mls_mpm import first_substeps, frame_substeps
 from pigjax.overlay import id_image, legend_sheet, overlay
 from pigjax.particles import deform
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
-from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, render_config, segment, signature
+from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
 from pigjax.scene.report import RunReport
 from pigjax.scene.schema import Scene
 from pigjax.segmentation import Labels
@@ -36,7 +36,9 @@ Progress = Callable[[str, int, int], None]  # stage, done, of
 
 
 @checked
-def run_scene(scene: Scene, out_dir: str | os.PathLike[str], *, progress: Progress | None = None) -> RunReport:
+def run_scene(
+    scene: Scene, out_dir: str | os.PathLike[str], *, progress: Progress | None = None, overwrite: bool = False
+) -> RunReport:
     """Simulate a scene and draw its video. Host.
 
     Into `out_dir` go `video.mp4`, `contact_sheet.png`, `objects.png` (the objects in their colours), `labels.npz`,
@@ -47,10 +49,11 @@ def run_scene(scene: Scene, out_dir: str | os.PathLike[str], *, progress: Progre
         scene: as `load_scene` gives it.
         out_dir: folder for the results, made if it is missing.
         progress: told each stage, frames done and frames to do.
+        overwrite: replace states in `out_dir` that were made from something else, instead of refusing them.
 
     Raises:
-        InputError: a file is missing or damaged, the scene asks for something that cannot be, or the states in
-            `out_dir` belong to another scene.
+        StaleError: the states in `out_dir` were made from other settings or files; it names what changed.
+        InputError: a file is missing or damaged, or the scene asks for something that cannot be.
         SimulationError: the simulation broke down; states up to the last good frame are kept.
     """
     out = io.output_folder(out_dir, files=_FILES, folders=("states",))
@@ -59,17 +62,26 @@ def run_scene(scene: Scene, out_dir: str | os.PathLike[str], *, progress: Progre
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            _run(scene, out, report, tell)
-        finally:
-            report.warnings += list(dict.fromkeys(str(w.message) for w in caught))
-            io.write_json(out / "report.json", report.as_dict())
+            _run(scene, out, report, tell, overwrite)
+        except StaleError:
+            raise  # report.json still tells of the results that are there
+        except BaseException:
+            _leave_report(report, caught, out)
+            raise
+        _leave_report(report, caught, out)
     return report
 
 
-def _run(scene: Scene, out: Path, report: RunReport, tell: Progress) -> None:
+def _leave_report(report: RunReport, caught: list[warnings.WarningMessage], out: Path) -> None:
+    report.warnings += list(dict.fromkeys(str(w.message) for w in caught))
+    io.write_json(out / "report.json", report.as_dict())
+
+
+def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: bool) -> None:
     with report.stage("read"):
         inputs = read_inputs(scene)
-        key = signature(scene)
+        parts = provenance(scene, inputs)
+        key = io.claim(out / "states", parts, results=("*.npz", "last.ckpt"), overwrite=overwrite)
     with report.stage("segment"):
         tell("segment", 0, 1)
         labels = segment(scene, inputs)
@@ -80,7 +92,7 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress) -> None:
         io.save_labels(out / "labels.npz", labels.object_id, labels.votes, labels.confidence, labels.ids)
     _describe(scene, inputs, plan, labels, report)
     with report.stage("simulate"):
-        _simulate(scene, plan, out / "states", key, report, tell)
+        _simulate(scene, plan, out / "states", parts, key, report, tell)
     with report.stage("draw"):
         _draw(scene, inputs, plan, labels, out, key, report, tell)
 
@@ -112,27 +124,42 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
     }
 
 
-def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunReport, tell: Progress) -> None:
-    """Simulate what is not on disk yet, one rollout per frame on a grid that is fitted anew."""
+def _simulate(
+    scene: Scene, plan: Plan, folder: Path, parts: dict[str, str], key: str, report: RunReport, tell: Progress
+) -> None:
+    """Simulate what is not on disk yet, one rollout per frame on a grid that is fitted to its matter.
+
+    Goes on from the last checkpoint. States that are missing before it are made again from the start, with the same
+    bits.
+    """
     frames, particles = scene.simulation.frames, plan.particles
-    done = io.last_state(folder, signature=key) if folder.exists() else None
+    present = io.readable_states(folder, signature=key)
     checkpoint = folder / "last.ckpt"
     fit = Fit() if plan.sleep is None else Sleeper(settings=plan.sleep, body=np.asarray(particles.body))
     # the same for a run that goes on as for one from the start
     domain = vast_grid(scene.simulation.dx)
     steps: dict[str, Any] = {"frame_dt": plan.frame_dt, "gravity": plan.gravity, "colliders": plan.colliders}
     config, first = first_substeps(particles, domain, plan.table, plan.config, frames=max(frames, 1), **steps)
-    if done is None:
-        done = 0
-        _save(folder, 0, particles, health_record(particles, None, plan.gravity), fit, key, checkpoint)
-    elif done < frames:
-        saved, particles, memory = io.load_pytree(checkpoint, (np.zeros((), np.int64), particles, fit.memory()))
-        done = int(saved)
-        fit.remember(memory)
+    saved = io.resumed(checkpoint, (np.zeros((), np.int64), particles, fit.memory()), parts=parts)
+    last = 0 if saved is None else int(saved[0])
+    missing = set(range(last + 1)) - present  # of a run without a checkpoint all frames from the first are made again
+    repaired = 0 if saved is None else max(missing, default=0)
+    if saved is None or 0 in missing:
+        _save(folder, 0, particles, health_record(particles, None, plan.gravity), key)
+    if saved is None:
+        _checkpoint(checkpoint, 0, particles, fit, parts)
+    if repaired:
+        warnings.warn(f"{folder}: states of {len(missing)} frames are missing or damaged; made again.", stacklevel=2)
     report.modelled["integrator"] = config.integrator
     dtype = particles.x.dtype
-    for frame in range(done + 1, frames + 1):
+    if saved is not None and not repaired:
+        fit.remember(saved[2])
+    todo = [*range(1, repaired + 1), *range(last + 1, frames + 1)]
+    for frame in todo:
         tell("simulate", frame - 1, frames)
+        if saved is not None and frame == last + 1:
+            _, particles, memory = saved
+            fit.remember(memory)
         substeps = frame_substeps(first, particles, domain, plan.table, config, frame=frame - 1, **steps)
         particles, _, health = fit.frame(
             particles,
@@ -155,11 +182,14 @@ def _simulate(scene: Scene, plan: Plan, folder: Path, key: str, report: RunRepor
                 f"frame {frame} of {frames}: {', '.join(health.problems())}; states up to frame {frame - 1} are kept in"
                 f" {folder}. Lower simulation.cfl, or make matter softer or slower."
             )
-        _save(folder, frame, particles, record, fit, key, checkpoint)
+        if frame > last or frame in missing:
+            _save(folder, frame, particles, record, key)
+        if frame > last:
+            _checkpoint(checkpoint, frame, particles, fit, parts)
     tell("simulate", frames, frames)
     records = _records(folder, frames, key)
     most = max((int(record["substeps"]) for frame, record in records.items() if frame), default=first)
-    report.sizes |= {"substeps_per_frame": most, "last_grid": fit.shape, "resumed_from_frame": done}
+    report.sizes |= {"substeps_per_frame": most, "last_grid": fit.shape, "resumed_from_frame": last}
     report.health |= summary(records)
     report.warnings += remarks(report.health, driven=any(collider.moves for collider in plan.colliders))
     if isinstance(fit, Sleeper):
@@ -176,11 +206,14 @@ def _records(folder: Path, frames: int, key: str) -> dict[int, Record]:
     return records
 
 
-def _save(folder: Path, frame: int, particles: Particles, record: Record, fit: Fit, key: str, checkpoint: Path) -> None:
+def _save(folder: Path, frame: int, particles: Particles, record: Record, key: str) -> None:
     arrays: dict[str, Any] = {"x": particles.x, "v": particles.v, "F_visual": particles.F_visual}
     arrays |= {MARK + name: values for name, values in record.items()}
     io.save_state(folder, frame, {name: np.asarray(a) for name, a in arrays.items()}, signature=key)
-    io.save_pytree(checkpoint, (np.asarray(frame), particles, fit.memory()))
+
+
+def _checkpoint(path: Path, frame: int, particles: Particles, fit: Fit, parts: dict[str, str]) -> None:
+    io.save_pytree(path, (np.asarray(frame), particles, fit.memory()), parts=parts)
 
 
 def _draw(

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from msgspec.structs import asdict, replace
 
 from pigjax import io
 from pigjax.arguments import checked
@@ -23,18 +24,32 @@ from pigjax.study.voting import Voting, voting
 from pigjax.tune import Bounds, History, Table, fit, search, sweep
 
 Row = Mapping[str, Any]
+_FILES = ("gaussians", "names", "masks")  # of a scene; its photos and cameras enter by what is computed from them
 _SOFT_VOTES = 0.002  # temperature of a tuned vote that states none: a wider one tells no small tau_d from a larger
 
 
 @checked
-def sweep_study(study: Study, out_dir: str | Path, *, progress: Callable[[int, int], Any] | None = None) -> Table:
+def sweep_study(
+    study: Study,
+    out_dir: str | Path,
+    *,
+    progress: Callable[[int, int], Any] | None = None,
+    overwrite: bool = False,
+) -> Table:
     """Score every set of parameters of a study. Host.
 
     Into `out_dir` go `table.csv`, `table.npz`, `sweep.png` (a curve of one parameter, a heat map of two), `best.json`
     and `best.toml`, the scene with the best values. What is finished is kept, so that a killed sweep goes on. Where
     all parameters are of the clamp, one simulation serves all.
 
+    Args:
+        study: as `load_study` gives it.
+        out_dir: folder for the results, made if it is missing.
+        progress: told rows done and rows to do.
+        overwrite: replace rows that were made from something else, instead of refusing them.
+
     Raises:
+        StaleError: `out_dir` holds rows of another study, scene, objective or other files; it names what changed.
         InputError: a file is missing, a parameter or an objective is unknown, or nothing could be scored.
     """
     out = io.output_folder(
@@ -50,6 +65,8 @@ def sweep_study(study: Study, out_dir: str | Path, *, progress: Callable[[int, i
         check=partial(_check, shared[0]),
         resume=out / "rows",
         callback=progress,
+        mark=_parts(study, "tune"),
+        overwrite=overwrite,
     )
     if jax.process_index() == 0:
         table.save(out / "table.csv")
@@ -61,14 +78,25 @@ def sweep_study(study: Study, out_dir: str | Path, *, progress: Callable[[int, i
 
 @checked
 def tune_study(
-    study: Study, out_dir: str | Path, *, progress: Callable[[int, int, str], Any] | None = None
+    study: Study,
+    out_dir: str | Path,
+    *,
+    progress: Callable[[int, int, str], Any] | None = None,
+    overwrite: bool = False,
 ) -> tuple[Row, History]:
     """Find the parameters of least loss. Host.
 
     Into `out_dir` go `history.npz`, `history.png`, `best.json` and `best.toml`, the scene with the best values. A
     killed search goes on from its checkpoint.
 
+    Args:
+        study: as `load_study` gives it.
+        out_dir: folder for the results, made if it is missing.
+        progress: told steps done, steps to do, and the loss in words.
+        overwrite: begin anew where the checkpoint belongs to something else, instead of refusing it.
+
     Raises:
+        StaleError: `out_dir` holds the search of another study, scene, objective or other files; it names what changed.
         InputError: a file is missing, a parameter or an objective is unknown, a start lies out of bounds.
         SimulationError: nothing that was tried could be simulated.
     """
@@ -79,13 +107,16 @@ def tune_study(
     trial, shared = _trial(study, ends, soft=spec.method == "adam")
     start = {name: _start(name, study, shared[0]) for name in study.parameters}
 
+    function = study.objective.function
+
     def loss(values: Row, shared: Any) -> tuple[jax.Array, Scores]:
         scores = trial(values, shared)
         if "loss" not in scores:
-            raise SceneError(f"objective.function = {study.objective.function!r} gives no 'loss' to make small.")
+            raise SceneError(f"objective.function = {function!r} gives no 'loss' to make small.")
         return scores["loss"], scores
 
-    common: dict[str, Any] = {"bounds": bounds, "shared": shared}
+    common: dict[str, Any] = {"bounds": bounds, "shared": shared, "overwrite": overwrite}
+    common["mark"] = _parts(study, "sweep")
     if progress is not None:
         total = spec.steps
         common["callback"] = lambda step: progress(step.step, total, f"loss {step.loss:.4g}")
@@ -103,6 +134,25 @@ def tune_study(
     history.plot(out / "history.png")
     _leave_best(study, best, out)
     return best, history
+
+
+def _parts(study: Study, unused: str) -> dict[str, Any]:
+    """Settings and files that a study depends on, by the names that a message can tell; how it is shared out is not."""
+    settings = asdict(study)
+    for name in ("scene", "folder", unused):
+        settings.pop(name)
+    settings |= {} if unused == "sweep" else {"sweep": replace(study.sweep, batch=None)}
+    scene, home = study.to_scene(), Path(study.folder)
+    own = asdict(scene)
+    for name in ("folder", "accuracy"):
+        own.pop(name)
+    files = {name: scene.path(path) for name in _FILES if (path := getattr(scene.input, name)) is not None}
+    options = study.objective.options
+    if study.objective.is_code():
+        files["objective"] = home / study.objective.function.rpartition(":")[0]
+    if isinstance(target := options.get("target"), str):
+        files["target"] = home / target
+    return {**settings, "scene": own, "content of": {name: io.file_digest(path) for name, path in files.items()}}
 
 
 def _trial(study: Study, rows: Sequence[Row], *, soft: bool) -> tuple[Callable[..., Scores], tuple[Any, ...]]:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -52,6 +50,8 @@ def fit(
     has_aux: bool = False,
     checkpoint: str | os.PathLike[str] | None = None,
     every: int = 10,
+    mark: Any = None,
+    overwrite: bool = False,
 ) -> tuple[Any, History]:
     """Make a loss small by gradients. Host.
 
@@ -75,13 +75,17 @@ def fit(
         has_aux: see `loss`.
         checkpoint: file that a killed search goes on from, bit for bit; it does not keep the scores of `has_aux`.
         every: steps between checkpoints.
+        mark: what the loss depends on beside its code, what it closes over and `shared`, as a mapping by name or any
+            value: files that it reads, for example.
+        overwrite: begin anew where the checkpoint belongs to another search, instead of refusing it.
 
     Returns:
         The best parameters met, and the history.
 
     Raises:
-        InputError: a start on or beyond its bounds, bounds for unknown parameters, a count below 1, or the checkpoint
-            of another search.
+        StaleError: the checkpoint was made with another loss, start, optimiser, bounds, shared arrays or settings; it
+            names which.
+        InputError: a start on or beyond its bounds, bounds for unknown parameters, or a count below 1.
         SimulationError: the loss is not finite at the start, or around the best parameters.
     """
     for option, count in (("steps", steps), ("every", every), ("patience", 1 if patience is None else patience)):
@@ -89,8 +93,11 @@ def fit(
             raise InputError(f"{option} = {count}: must be 1 or more.")
     names, leaves, limits, rebuild = flat_parameters(params, bounds)
     descent = optimizer if isinstance(optimizer, optax.GradientTransformation) else optax.adam(optimizer)
-    rate = None if descent is optimizer else float(optimizer)
-    mark = fingerprint(names, limits, rate, clip, patience, tolerance, restarts)
+    parts = parts_of_search(
+        mark, loss=loss, start=io.digest(names, leaves), bounds=io.digest(limits), optimizer=optimizer,
+        steps=steps, clip=clip, patience=patience, tolerance=tolerance, restarts=restarts, has_aux=has_aux,
+        shared=io.digest(shared),
+    ) if checkpoint is not None else {}  # fmt: skip
     if clip is not None:
         descent = optax.chain(optax.clip_by_global_norm(clip), descent)
 
@@ -112,8 +119,11 @@ def fit(
     state = _State(free, descent.init(free), free, np.asarray(np.inf), np.asarray(1.0), zero, zero, zero)
     recorder = Recorder(names, [np.shape(leaf) for leaf in leaves], steps)
     begun = 0
-    if checkpoint is not None and Path(checkpoint).exists():
-        state, recorder, begun = _resumed(Path(checkpoint), state, recorder, leaves, mark)
+    if checkpoint is not None:
+        like = (np.asarray(0), state, recorder.arrays())
+        if (found := io.resumed(checkpoint, like, parts=parts, overwrite=overwrite)) is not None:
+            begun, state = int(found[0]), found[1]
+            recorder.restore(found[2], begun)
     finished = patience is not None and state.stale >= patience
     stop = "plateau" if finished else "steps"
     for number in range(begun, begun if finished else steps):
@@ -127,7 +137,7 @@ def fit(
         wanted = callback is not None and callback(told) is True
         last = ended or wanted or number + 1 == steps
         if checkpoint is not None and (last or (number + 1) % every == 0):
-            io.save_pytree(checkpoint, (np.asarray(number + 1), mark, leaves, state, recorder.arrays()))
+            io.save_pytree(checkpoint, (np.asarray(number + 1), state, recorder.arrays()), parts=parts)
         if ended or wanted:
             stop = "plateau" if ended else "callback"
             break
@@ -175,22 +185,10 @@ def _next(state, value, good, moved, optimiser, descent, patience, tolerance, re
     )
 
 
-def _resumed(path, state, recorder, leaves, mark):
-    like = (np.asarray(0), mark, leaves, state, recorder.arrays())
-    number, found, start, state, arrays = io.load_pytree(path, like)
-    if any(not np.array_equal(old, new) for old, new in zip(start, leaves)):
-        raise InputError(f"{path}: belongs to a search from another start; delete it, or choose another checkpoint.")
-    if not np.array_equal(found, mark):
-        raise InputError(
-            f"{path}: belongs to a search with other bounds or settings; delete it, or choose another checkpoint."
-        )
-    recorder.restore(arrays, int(number))
-    return state, recorder, int(number)
-
-
-def fingerprint(*settings: Any) -> np.ndarray:
-    """What tells the settings of a search from others, for its checkpoint."""
-    return np.frombuffer(hashlib.sha256(repr(settings).encode()).digest(), np.uint8)
+def parts_of_search(mark: Any, **named: Any) -> dict[str, str]:
+    """Parts of the provenance of a search: the caller's mark, and what the search itself depends on."""
+    parts = io.parts_of({"": mark if isinstance(mark, Mapping) else {"mark": mark}})
+    return parts | io.parts_of({**named, "precision": str(jnp.result_type(float))})
 
 
 def _broken(names, used, value, norm):

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import os
-import pickle
 import warnings
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pigjax import io
 from pigjax.arguments import checked
 from pigjax.errors import InputError, SimulationError
-from pigjax.io.files import writing
-from pigjax.tune.fit import fingerprint, flat_parameters
+from pigjax.tune.fit import flat_parameters, parts_of_search
 from pigjax.tune.history import History, Recorder, Step
 
 _SPREAD = 0.5  # of the first candidates, in the unconstrained numbers
@@ -37,6 +35,8 @@ def search(
     seed: int = 0,
     checkpoint: str | os.PathLike[str] | None = None,
     callback: Callable[[Step], Any] | None = None,
+    mark: Any = None,
+    overwrite: bool = False,
 ) -> tuple[Any, History]:
     """Make a loss small without gradients, by CMA-ES (Hansen 2016, arXiv 1604.00772). Host.
 
@@ -54,14 +54,18 @@ def search(
         vectorize: False calls the loss candidate by candidate outside of jit; what it raises for bad input or a broken
             simulation counts as not finite.
         seed: of the candidates.
-        checkpoint: file that a killed search goes on from.
+        checkpoint: file that a killed search goes on from, bit for bit: it holds the losses, by which the generations
+            so far are drawn again.
         callback: told the best candidate of each generation; True stops the search.
+        mark: as in `fit`.
+        overwrite: as in `fit`.
 
     Returns:
         The best parameters met, and the history of all candidates.
 
     Raises:
-        InputError: `cma` is missing, a start on or beyond its bounds, or the checkpoint of another search.
+        StaleError: the checkpoint was made with another loss, start, bounds, shared arrays or settings; it names which.
+        InputError: `cma` is missing, or a start on or beyond its bounds.
         SimulationError: no candidate had a finite loss.
     """
     try:
@@ -85,19 +89,31 @@ def search(
 
     many = jax.jit(jax.vmap(loss_at, (0, None))) if vectorize else partial(_one_by_one, loss_at)
     spelled_out = jax.jit(jax.vmap(values_of))
-    options: dict[str, Any] = {"seed": seed + 1, "verbose": -9, "maxfevals": np.inf}
+    # a generator of its own: candidates depend on nothing else that draws random numbers
+    randn = np.random.RandomState(seed + 1).randn
+    options: dict[str, Any] = {"seed": np.nan, "randn": randn, "verbose": -9, "maxfevals": np.inf}
     if population is not None:
         options["popsize"] = population
     # cma knows no single number: a second one, without any say, stands beside it
     padded = start if len(start) > 1 else np.append(start, 0.0)
-    key = fingerprint(names, limits, padded.tolist(), evaluations, spread, seed, population).tobytes()
-    strategy, recorder, taken = cma.CMAEvolutionStrategy(padded, spread, options), None, 0
+    strategy, taken = cma.CMAEvolutionStrategy(padded, spread, options), 0
     size = strategy.popsize
     recorder = Recorder(names, [leaf.shape for leaf in leaves], -(-evaluations // size) * size)
-    if checkpoint is not None and Path(checkpoint).exists():
-        strategy, recorder, taken = _restored(Path(checkpoint), key)
+    parts: dict[str, str] = {}
+    if checkpoint is not None:
+        parts = parts_of_search(
+            mark, loss=loss, start=io.digest(names, leaves), bounds=io.digest(limits), evaluations=evaluations,
+            spread=spread, seed=seed, population=population, vectorize=vectorize, shared=io.digest(shared),
+        )  # fmt: skip
+        like = (np.asarray(0), recorder.arrays())
+        if (found := io.resumed(checkpoint, like, parts=parts, overwrite=overwrite)) is not None:
+            taken = int(found[0])
+            recorder.restore(found[1], taken)
+    for begin in range(0, taken, size):
+        own = slice(begin, begin + size)
+        _tell(strategy, strategy.ask(), recorder.numbers[own, 0], recorder.good[own])
     stop = "steps"
-    while taken < evaluations:
+    while taken < evaluations and not (taken and strategy.stop()):
         candidates = strategy.ask()
         values = spelled_out(jnp.asarray(np.stack(candidates)[:, : len(start)]))
         losses = np.asarray(many(values, shared), float)
@@ -105,21 +121,16 @@ def search(
         steps = [
             recorder.add(taken + k, losses[k], np.nan, [leaf[k] for leaf in values], bool(good[k])) for k in range(size)
         ]
-        if good.any():  # of a generation that broke down as a whole nothing is learnt: the next is drawn as it was
-            worst = losses[good].max()
-            with warnings.catch_warnings():  # that a generation before was not told
-                warnings.simplefilter("ignore", cma.evolution_strategy.InjectionWarning)
-                strategy.tell(candidates, np.where(good, losses, worst + 1 + abs(worst)))
+        _tell(strategy, candidates, losses, good)
         taken += size
         if checkpoint is not None:
-            _save(Path(checkpoint), key, strategy, recorder, taken)
+            io.save_pytree(checkpoint, (np.asarray(taken), recorder.arrays()), parts=parts)
         told = min(steps, key=lambda step: step.loss if step.good else np.inf)._replace(step=taken)
         if callback is not None and callback(told) is True:
             stop = "callback"
             break
-        if strategy.stop():
-            stop = "plateau"
-            break
+    if stop == "steps" and strategy.stop():
+        stop = "plateau"
     history = recorder.history(stop)
     if not history.good.any():
         raise SimulationError(f"none of {taken} candidates had a finite loss: start elsewhere, or narrow the bounds.")
@@ -138,25 +149,16 @@ def _one_by_one(loss_at, values, shared):
     return losses
 
 
-def _save(path: Path, key: bytes, strategy: Any, recorder: Recorder, taken: int) -> None:
-    with writing(path) as unfinished:
-        unfinished.write_bytes(pickle.dumps((key, strategy, recorder, taken)))
+def _tell(strategy: Any, candidates: list[np.ndarray], losses: np.ndarray, good: np.ndarray) -> None:
+    """Tell the strategy the losses of a generation.
 
+    Of a generation that broke down as a whole nothing is learnt: the next is drawn from the same distribution.
+    """
+    import cma
 
-def _restored(path: Path, key: bytes) -> tuple[Any, Recorder, int]:
-    try:
-        found, strategy, recorder, taken = pickle.loads(path.read_bytes())
-    except (
-        pickle.UnpicklingError,
-        LookupError,
-        EOFError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        ImportError,
-        OSError,
-    ) as error:
-        raise InputError(f"{path}: not a checkpoint of a search ({error}); delete it and run again.") from None
-    if found != key:
-        raise InputError(f"{path}: belongs to another search (start, bounds, evaluations or seed); delete it.")
-    return strategy, recorder, taken
+    if not good.any():
+        return
+    worst = losses[good].max()
+    with warnings.catch_warnings():  # of a generation before that was not told
+        warnings.simplefilter("ignore", cma.evolution_strategy.InjectionWarning)
+        strategy.tell(candidates, np.where(good, losses, worst + 1 + abs(worst)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import os
 import pickle
@@ -41,6 +40,8 @@ def sweep(
     check: Callable[[Any], None] | None = None,
     vectorize: bool = True,
     callback: Progress | None = None,
+    mark: Any = None,
+    overwrite: bool = False,
 ) -> Table:
     """Evaluate `fn` for every set of parameters. Host.
 
@@ -62,17 +63,26 @@ def sweep(
         vectorize: False calls `fn` row after row outside of jit, for functions that no one can trace; what they raise
             for bad input or a broken simulation marks the row.
         callback: told rows done and rows to do after each batch.
+        mark: what the results depend on beside `fn` (its code and what it closes over), the parameters and `shared`,
+            as a mapping by name or any value: files that `fn` reads, for example.
+        overwrite: replace rows in `resume` that were made from something else, instead of refusing them.
 
     Raises:
-        InputError: no rows, rows of different structure, or `resume` holds another sweep.
+        StaleError: `resume` holds rows of another function, other parameters, shared arrays or marks; it names which.
+        InputError: no rows, or rows of different structure.
     """
     rows = _rows(grid_of_parameters)
     stacked = _stacked(rows)
     call: Function = fn if shared is None else partial(_with_shared, fn, shared)
     errors = [_refusal(check, row) for row in rows]
     todo = [index for index, error in enumerate(errors) if error is None]
-    keep = _Keep(resume, _signature(fn, stacked, shared) if resume is not None else "")
-    results = dict(keep.read())
+    keep = _Keep(resume)
+    if resume is not None:
+        parts = io.parts_of({"": mark if isinstance(mark, Mapping) else {"mark": mark}})
+        parts |= io.parts_of({"fn": fn, "parameters": io.digest(stacked), "shared": io.digest(shared)})
+        parts["precision"] = str(jnp.result_type(float))
+        keep.claim(parts, overwrite)
+    results = dict(keep.read(len(rows)))
     if callback is not None and results:
         callback(len(results), len(todo))
     remaining = [index for index in todo if index not in results]
@@ -131,32 +141,31 @@ def _refusal(check: Callable[[Any], None] | None, row: Any) -> str | None:
     return None
 
 
-def _signature(fn: Function, stacked: Any, shared: Any) -> str:
-    """Of all that the results depend on, as far as it can be told."""
-    digest = hashlib.sha256(getattr(fn, "__qualname__", type(fn).__name__).encode())
-    for path, leaf in jax.tree_util.tree_leaves_with_path((stacked, shared)):
-        digest.update(jax.tree_util.keystr(path).encode())
-        digest.update(np.ascontiguousarray(leaf).tobytes())
-    return digest.hexdigest()[:16]
-
-
 class _Keep:
     """Finished rows in a folder; of several processes the first one writes, and tells the others."""
 
-    def __init__(self, folder: str | os.PathLike[str] | None, signature: str):
-        self.folder, self.signature = folder, signature
+    def __init__(self, folder: str | os.PathLike[str] | None):
+        self.folder, self.signature = folder, ""
 
-    def read(self) -> dict[int, dict[str, np.ndarray]]:
+    def claim(self, parts: dict[str, str], overwrite: bool) -> None:
+        assert self.folder is not None
+        if jax.process_index() == 0:
+            self.signature = io.claim(self.folder, parts, results=("*.npz",), overwrite=overwrite)
+
+    def read(self, count: int) -> dict[int, dict[str, np.ndarray]]:
+        """Rows on disk; damaged files are left out with a warning, so that their rows are computed again."""
         if self.folder is None:
             return {}
         found: dict[int, dict[str, np.ndarray]] = {}
         if jax.process_index() == 0:
             for path in sorted(Path(self.folder).glob("*.npz")):
-                state = io.load_state(self.folder, int(path.stem), signature=self.signature)
-                index = state.pop("index")
-                found |= {
-                    int(k): {name: np.asarray(own[at]) for name, own in state.items()} for at, k in enumerate(index)
-                }
+                if not path.stem.isdecimal():
+                    continue
+                try:
+                    state = io.load_state(self.folder, int(path.stem), signature=self.signature)
+                    found |= _rows_of(path, state, count)
+                except InputError as error:
+                    io.set_aside(path, error)
         return _told_by_first(found) if jax.process_count() > 1 else found
 
     def write(self, done: dict[int, dict[str, np.ndarray]]) -> None:
@@ -164,6 +173,14 @@ class _Keep:
             return
         arrays = {name: np.stack([row[name] for row in done.values()]) for name in next(iter(done.values()))}
         io.save_state(self.folder, min(done), {**arrays, "index": np.array(list(done))}, signature=self.signature)
+
+
+def _rows_of(path: Path, state: dict[str, np.ndarray], count: int) -> dict[int, dict[str, np.ndarray]]:
+    index = state.pop("index", np.zeros(0))
+    whole = index.ndim == 1 and index.dtype.kind in "iu" and ((index >= 0) & (index < count)).all()
+    if not (whole and len(index) and state and all(own.shape[:1] == index.shape for own in state.values())):
+        raise InputError(f"{path}: its rows are not those of a sweep; delete it, and they are computed again.")
+    return {int(k): {name: np.asarray(own[at]) for name, own in state.items()} for at, k in enumerate(index)}
 
 
 def _told_by_first(found: dict[int, dict[str, np.ndarray]]) -> dict[int, dict[str, np.ndarray]]:
