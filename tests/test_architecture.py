@@ -106,6 +106,25 @@ def test_only_io_touches_files():
                     )
 
 
+CONTRIBUTING = PACKAGE.parent / "CONTRIBUTING.md"
+
+
+def layers_as_text():
+    """The table of layers that CONTRIBUTING.md holds: `python tests/test_architecture.py` writes it there."""
+    rows = ["| layer | module | what it is |", "|---|---|---|"]
+    for layer, modules in reversed(list(enumerate(FLOORS))):
+        for module in sorted(modules):
+            package = PACKAGE / module / "__init__.py"
+            file = package if package.is_file() else PACKAGE / f"{module}.py"
+            said = (ast.get_docstring(ast.parse(file.read_text())) or "").splitlines()[0]
+            rows.append(f"| {layer} | `{module}{'/' if package.is_file() else ''}` | {said} |")
+    return "\n".join(rows)
+
+
+def test_contributing_prints_the_layers():
+    assert layers_as_text() in CONTRIBUTING.read_text(), "run python tests/test_architecture.py"
+
+
 def test_products_keep_full_precision():
     host = {"starts", "solids", "shells", "association", "io"}  # float64 of NumPy
     rounded = {"matmul", "einsum", "dot", "vdot", "tensordot", "inner"}  # to TF32, on accelerators
@@ -144,3 +163,8 @@ def test_every_public_name_has_a_docstring():
 
     missing = [name for name in pigjax.__all__ if not (getattr(pigjax, name).__doc__ or "").strip()]
     assert missing == []
+
+
+if __name__ == "__main__":
+    before, _, rest = CONTRIBUTING.read_text().partition("| layer |")
+    CONTRIBUTING.write_text(before + layers_as_text() + "\n" + rest[rest.index("\n\n") + 1 :])
