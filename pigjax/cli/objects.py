@@ -69,7 +69,7 @@ def reconstruct(
     import jax
 
     from pigjax import io
-    from pigjax.reconstruct import FitConfig, reconstruct
+    from pigjax.reconstruct import FitConfig, provenance, reconstruct
     from pigjax.reconstruct import Progress as Step
     from pigjax.splat import RenderConfig
 
@@ -94,6 +94,8 @@ def reconstruct(
     if out is None:
         out = Path(f"reconstruction-{_name_of(views)}")
     out = io.output_folder(out, files=("gaussians.ply", "poses.json", "report.json"), folders=("previews",))
+    results = ("gaussians.ply", "poses.json", "report.json", "checkpoint", "previews")
+    io.claim(out, provenance(loaded, config, points), results=results, overwrite=overwrite)
     with progress("{task.fields[state]}") as bar:
         task, last = bar.add_task("reconstruct", total=steps, state=""), [""]
 
