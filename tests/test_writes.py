@@ -125,8 +125,8 @@ def test_masks_are_not_written_out_of_their_folder(tmp_path, name):
 @pytest.mark.parametrize("name", HOSTILE)
 def test_names_are_printed_literally(monkeypatch, tmp_path, name):
     io.write_json(tmp_path / "names.json", {"1": name})
-    monkeypatch.setattr(io, "load_gaussians", lambda path: None)
-    monkeypatch.setattr(io, "load_views", lambda path, masks: None)
+    monkeypatch.setattr(io, "load_gaussians", lambda path, **k: None)
+    monkeypatch.setattr(io, "load_views", lambda path, **k: None)
     monkeypatch.setattr(objects, "segment_files", lambda *a, **k: {1: 7})
     arguments = ["segment", "a.ply", "views", "--names", str(tmp_path / "names.json"), "-o", str(tmp_path)]
     said = CliRunner().invoke(cli.app, arguments, catch_exceptions=False, env={"COLUMNS": "120"})

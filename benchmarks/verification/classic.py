@@ -66,7 +66,7 @@ def _give(setting, go, at, chunk, shared):
 
 def _take(setting, shape, bodies, law, go, at, windows, state, shared):
     """A chunk after the step, and its tally, as `substep._take`."""
-    (dt, dx, parameters), kernel = shared, setting.kernel
+    (dt, dx, parameters, inner), kernel = shared, setting.kernel
 
     def gradients(read, plane):
         pairs = (plane, read.planes[:, 2]), (read.by_y, read.planes[:, 0]), (read.by_z, read.planes[:, 0])
@@ -83,7 +83,7 @@ def _take(setting, shape, bodies, law, go, at, windows, state, shared):
     gradient = stage(go, gradients, read, at.plane)
     moments = transfers._moments(kernel, go, read.planes, at.plane)
     new = substep.in_rows(stage(go, respond, state, moments, gradient, dt, dx, parameters))
-    return substep._settle(shape, bodies, go, new, state)
+    return substep._settle(shape, bodies, go, new, state, inner)
 
 
 def _figures(kernel):

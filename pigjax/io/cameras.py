@@ -76,7 +76,7 @@ def load_views(
     missing_masks: str = "error",
     holes: int = 0,
     split: str | None = None,
-    only: Sequence[str] | None = None,
+    only: Sequence[str] | str | None = None,
     max_size: int | None = None,
     hold_out: int = 8,
     background: Background = 0.0,
@@ -95,7 +95,7 @@ def load_views(
         missing_masks: "error", or "empty": a view without a mask gets background everywhere.
         holes: background of up to this many pixels that one object encloses becomes that object.
         split: load only the views of this split.
-        only: load only the views of these names.
+        only: load only the views of these names, or of this one.
         max_size: shrink photos so that neither side is longer [px]; intrinsics follow.
         hold_out: where the file assigns no splits, every n-th view is "test", from the first on, as in 3DGS; 0 or fewer
             views than that: all are "train".

@@ -58,6 +58,7 @@ def read_gaussians(
     return gaussians_of(path, readers[suffix](path), drop_invalid=drop_invalid, origin=origin)
 
 
+@checked
 def origin_of(path: PathLike) -> tuple[float, float, float]:
     """A round point near the middle of Gaussians or of a point cloud, to give as `origin=`. Host.
 
