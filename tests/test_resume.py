@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -86,8 +87,9 @@ def edit_names(root):
 
 
 def edit_masks(root):
-    path = root / "object_mask" / "v0.png"
-    io.save_masks(path.parent, ("v0",), np.flip(io.load_masks(path.parent, ("v0",), height=32, width=40), 2).copy())
+    mask = np.full((1, 32, 40), NEAR)
+    mask[:, :, 12:] = FAR
+    io.save_masks(root / "object_mask", ("v0",), mask)
 
 
 def edit_cameras(root):
@@ -97,8 +99,7 @@ def edit_cameras(root):
 
 def edit_gaussians(root):
     gaussians = walls()[0]
-    gaussians.means[0, 0] += 0.01
-    io.save_ply(root / "scene.ply", gaussians)
+    io.save_ply(root / "scene.ply", replace(gaussians, means=gaussians.means + np.float32(0.01)))
 
 
 EDITS = [
