@@ -26,11 +26,12 @@ from pigjax.io.files import (
 )
 from pigjax.io.formats import load_gaussians, origin_of, read_gaussians
 from pigjax.io.images import contact_sheet, read_image, write_image
-from pigjax.io.labels import StoredLabels, load_labels, save_labels
+from pigjax.io.labels import StoredLabels, digest_of_scene, load_labels, save_labels
 from pigjax.io.masks import load_masks, save_masks
 from pigjax.io.ply import load_ply, load_points, read_ply, save_ply
 from pigjax.io.provenance import check_same, claim, digest, file_digest, parts_of
 from pigjax.io.state import (
+    STATES,
     last_state,
     load_pytree,
     load_state,
@@ -39,11 +40,13 @@ from pigjax.io.state import (
     save_pytree,
     save_state,
     set_aside,
+    signed,
 )
 from pigjax.io.video import read_video, write_video
 
 __all__ = [
     "LAYOUTS",
+    "STATES",
     "Dataset",
     "StoredLabels",
     "Views",
@@ -52,6 +55,7 @@ __all__ = [
     "contact_sheet",
     "decoding",
     "digest",
+    "digest_of_scene",
     "file_digest",
     "id_named",
     "last_state",
@@ -91,6 +95,7 @@ __all__ = [
     "save_pytree",
     "save_state",
     "set_aside",
+    "signed",
     "write_csv",
     "write_image",
     "write_json",

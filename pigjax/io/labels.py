@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Array, Float, Integer, Num
 
 from pigjax.errors import InputError, MissingFileError
 from pigjax.io.archives import ArrayHeader, load_arrays, save_arrays
 from pigjax.io.files import PathLike
+from pigjax.io.provenance import digest
 
 _WHAT = "labels.npz of 'pigjax segment'"
 _REMEDY = "segment the scene again"
@@ -31,6 +33,8 @@ def save_labels(
     votes: Num[np.ndarray | Array, "n m"],
     confidence: Float[np.ndarray | Array, "n"],
     ids: Integer[np.ndarray | Array, "m"] | None = None,
+    *,
+    scene: str | None = None,
 ) -> None:
     """Write labels as `.npz`, whole or not at all. Host.
 
@@ -40,24 +44,34 @@ def save_labels(
         votes: views, or sums of alpha·T, for each id.
         confidence: share of the votes that the winner took, 0 to 1.
         ids: id of each column of `votes`; None: column k counts id k.
+        scene: of `digest_of_scene`, by which labels of other Gaussians are told; None: they cannot be told.
 
     Raises:
         InputError: the file cannot be written.
     """
-    columns = {} if ids is None else {"ids": ids}
+    columns: dict[str, Any] = {} if ids is None else {"ids": ids}
+    if scene is not None:
+        columns["scene"] = np.asarray(scene)
     save_arrays(path, {"object_id": object_id, "votes": votes, "confidence": confidence, **columns})
 
 
-def load_labels(path: PathLike, count: int | None = None) -> StoredLabels:
+def digest_of_scene(gaussians: Any) -> str:
+    """Digest of the numbers of Gaussians, in single precision as files hold them. Host."""
+    return digest([np.asarray(leaf, np.float32) for leaf in jax.tree.leaves(gaussians)])
+
+
+def load_labels(path: PathLike, count: int | None = None, *, scene: str | None = None) -> StoredLabels:
     """Labels of a file of `save_labels`. Host.
 
     Args:
         path: of the file.
         count: Gaussians that it must label; None takes any number.
+        scene: of `digest_of_scene`, the Gaussians that it must label where it says which it labels; None takes any.
 
     Raises:
         MissingFileError: there is no such file.
-        InputError: the file is damaged, labels another number of Gaussians, or holds values that labels cannot have.
+        InputError: the file is damaged, labels other Gaussians or another number of them, or holds values that labels
+            cannot have.
     """
 
     def check(headers: Mapping[str, ArrayHeader]) -> None:
@@ -72,6 +86,8 @@ def load_labels(path: PathLike, count: int | None = None) -> StoredLabels:
             raise
         raise InputError(f"{path}: not the {_WHAT} ({error.__cause__}); {_REMEDY}.") from error
     labels = StoredLabels(arrays["object_id"], arrays["votes"], arrays["confidence"], arrays.get("ids"))
+    if scene is not None and "scene" in arrays and str(arrays["scene"]) != scene:
+        raise InputError(f"{path}: labels the Gaussians of another file, as many as the scene has; segment it again.")
     lowest, highest = int(labels.object_id.min(initial=0)), int(labels.object_id.max(initial=0))
     if not -1 <= lowest <= highest < 2**31:
         raise InputError(f"{path}: object_id reaches from {lowest} to {highest}, not from -1 to 2³¹ - 1; {_REMEDY}.")

@@ -16,7 +16,7 @@ import re
 import sys
 import sysconfig
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +98,14 @@ def check_same(where: PathLike, found: Parts, parts: Parts) -> None:
         )
 
 
-def claim(folder: PathLike, parts: Parts, *, results: Sequence[str], overwrite: bool = False) -> str:
+def claim(
+    folder: PathLike,
+    parts: Parts,
+    *,
+    results: Sequence[str],
+    overwrite: bool = False,
+    signed: Callable[[Path, str], bool] | None = None,
+) -> str:
     """Take a folder for results of these parts, and give their digest. Host.
 
     A folder that holds none of `results` is taken as it is; one with results of the same parts may go on from them.
@@ -108,6 +115,7 @@ def claim(folder: PathLike, parts: Parts, *, results: Sequence[str], overwrite: 
         parts: of `parts_of`.
         results: patterns of what the caller leaves in the folder, "states" or "*.npz".
         overwrite: remove results of other or unknown parts instead of refusing them.
+        signed: whether all results in the folder carry the digest; asked where `provenance.json` is lost or damaged.
 
     Raises:
         StaleError: the folder holds results of other parts, or of unknown ones.
@@ -120,6 +128,9 @@ def claim(folder: PathLike, parts: Parts, *, results: Sequence[str], overwrite: 
     if old:
         found = _recorded(file)
         try:
+            if found is None and signed is not None and signed(folder, key):
+                found = dict(parts)
+                write_json(file, {"key": key, "parts": found})
             if found is None:
                 raise StaleError(
                     f"{folder}: holds {old[0].name} but no readable {FILE} that says what it was made from; choose"
@@ -140,8 +151,9 @@ def _recorded(file: Path) -> dict[str, str] | None:
     if not file.is_file():
         return None
     try:
-        parts = read_json(file)["parts"]
-        return {str(name): str(value) for name, value in parts.items()}
+        told = read_json(file)
+        parts = {str(name): str(value) for name, value in told["parts"].items()}
+        return parts if told["key"] == digest(sorted(parts.items())) else None
     except (InputError, LookupError, TypeError, AttributeError):
         return None
 

@@ -24,6 +24,7 @@ from pigjax.io.files import PathLike, decoding, existing, writing
 from pigjax.io.provenance import Parts, check_same
 
 _SIGNATURE = "signature"
+STATES = "[0-9]" * 6 + "*.npz"  # pattern of what `save_state` leaves, and not of other files
 Tree = TypeVar("Tree")
 
 
@@ -102,6 +103,18 @@ def readable_states(folder: PathLike, *, signature: str) -> set[int]:
             continue
         frames.add(int(path.stem))
     return frames
+
+
+def signed(folder: PathLike, signature: str) -> bool:
+    """Whether the folder holds readable states, all of them with this signature. Host."""
+    found = set()
+    for path in Path(folder).glob("*.npz"):
+        if path.stem.isdecimal():
+            try:
+                found.add(str(_read(path, prefix=_SIGNATURE)[_SIGNATURE]))
+            except InputError:
+                continue
+    return found == {signature}
 
 
 def save_pytree(path: PathLike, tree: Any, *, parts: Parts | None = None) -> None:

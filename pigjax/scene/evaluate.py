@@ -78,7 +78,7 @@ def evaluate_files(
     if labels is None:
         lifted = _lift(gaussians, dataset, fill=fill, **settings)
     else:
-        stored = io.load_labels(labels, len(gaussians))
+        stored = io.load_labels(labels, len(gaussians), scene=io.digest_of_scene(gaussians))
         lifted = Labels(
             jnp.asarray(stored.object_id),
             jnp.asarray(stored.votes),

@@ -87,7 +87,8 @@ def segment_files(
     assert train.masks is not None
     labels = lift(gaussians, train.cameras, train.masks, fill=fill, **settings)
     object_id = np.asarray(labels.object_id)
-    io.save_labels(out / "labels.npz", object_id, labels.votes, labels.confidence, labels.ids)
+    mark = io.digest_of_scene(gaussians) if origin is None else None  # else positions are not those of the file
+    io.save_labels(out / "labels.npz", object_id, labels.votes, labels.confidence, labels.ids, scene=mark)
     counts = {int(number): int(np.sum(object_id == number)) for number in np.unique(object_id)}
     for number in counts:
         io.save_ply(

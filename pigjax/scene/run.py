@@ -81,7 +81,8 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: 
     with report.stage("read"):
         inputs = read_inputs(scene)
         parts = provenance(scene, inputs)
-        key = io.claim(out / "states", parts, results=("*.npz", "last.ckpt"), overwrite=overwrite)
+        results = (io.STATES, "last.ckpt")
+        key = io.claim(out / "states", parts, results=results, overwrite=overwrite, signed=io.signed)
     with report.stage("segment"):
         tell("segment", 0, 1)
         labels = segment(scene, inputs)
@@ -89,12 +90,24 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: 
         tell("seed", 0, 1)
         plan = make_plan(scene, inputs, labels)
         labels = plan.labels
-        io.save_labels(out / "labels.npz", labels.object_id, labels.votes, labels.confidence, labels.ids)
+        io.save_labels(
+            out / "labels.npz",
+            labels.object_id,
+            labels.votes,
+            labels.confidence,
+            labels.ids,
+            scene=_mark(scene, inputs),
+        )
     _describe(scene, inputs, plan, labels, report)
     with report.stage("simulate"):
         _simulate(scene, plan, out / "states", parts, key, report, tell)
     with report.stage("draw"):
         _draw(scene, inputs, plan, labels, out, key, report, tell)
+
+
+def _mark(scene: Scene, inputs: Inputs) -> str | None:
+    """What tells the Gaussians of labels; nothing where positions are not those of the file."""
+    return None if scene.input.origin is not None else io.digest_of_scene(inputs.gaussians)
 
 
 def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: RunReport) -> None:

@@ -150,7 +150,7 @@ class _Keep:
     def claim(self, parts: dict[str, str], overwrite: bool) -> None:
         assert self.folder is not None
         if jax.process_index() == 0:
-            self.signature = io.claim(self.folder, parts, results=("*.npz",), overwrite=overwrite)
+            self.signature = io.claim(self.folder, parts, results=(io.STATES,), overwrite=overwrite, signed=io.signed)
 
     def read(self, count: int) -> dict[int, dict[str, np.ndarray]]:
         """Rows on disk; damaged files are left out with a warning, so that their rows are computed again."""
