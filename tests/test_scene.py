@@ -247,7 +247,7 @@ def test_drawing_anew_simulates_nothing_and_another_scene_is_refused(finished, f
     first = json.loads((done / "report.json").read_text())
     assert report.as_dict()["health"] == first["health"]
     assert report.sizes["substeps_per_frame"] == first["sizes"]["substeps_per_frame"]
-    with pytest.raises(InputError, match="belongs to another run"):
+    with pytest.raises(InputError, match="made from something else"):
         run_scene(scene_from(values(simulation__dx=0.06), folder=folder), out)
 
 

@@ -130,7 +130,7 @@ def test_a_killed_sweep_goes_on_and_computes_nothing_twice(tmp_path):
     table = sweep(scored, GRID, batch=4, resume=tmp_path, callback=lambda done, of: told.append((done, of)))
     assert told == [(8, 15), (12, 15), (15, 15)]
     np.testing.assert_array_equal(table["loss"], sweep(scored, GRID)["loss"])
-    with pytest.raises(InputError, match="belongs to another run"):
+    with pytest.raises(InputError, match="made from something else"):
         sweep(scored, {**GRID, "a": np.linspace(0, 2, 5)}, resume=tmp_path)
 
 

@@ -384,7 +384,9 @@ def test_a_stopped_command_says_how_to_go_on_and_leaves_no_half_file(tmp_path, n
 
 def test_a_command_stopped_while_libraries_load_says_its_sentence(tmp_path):
     (tmp_path / "pigjax").mkdir()
-    (tmp_path / "pigjax" / "__init__.py").write_text("import time; print('ready', flush=True); time.sleep(100)")
+    # short sleeps: a signal that comes just before a sleep is seen after it
+    waits = "import time; print('ready', flush=True); [time.sleep(0.1) for _ in range(1000)]"
+    (tmp_path / "pigjax" / "__init__.py").write_text(waits)
     code = "import pigjax_command; pigjax_command.main()"
     # the working folder comes first where modules are looked for
     assert killed(code, signals=[signal.SIGINT], cwd=tmp_path) == (130, SENTENCE)
