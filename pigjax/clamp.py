@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from pigjax.arguments import checked
-from pigjax.arrays import array_field, static_field
+from pigjax.arrays import array_field, in_precision, static_field
 from pigjax.checks import Limits, check_fields, shown
 from pigjax.errors import InputError
 from pigjax.linalg import aligned_svd, matmul3, polar, quat_to_matrix, svd
@@ -83,6 +83,7 @@ def eigen_clamp(
         raise InputError(f"eigen_clamp: mode = {mode!r} is unknown; choose one of {', '.join(_MODES)}.")
     if F.shape != (len(gaussians), 3, 3):
         raise InputError(f"eigen_clamp: F has shape {F.shape}; {len(gaussians)} Gaussians need one 3x3 matrix each.")
+    F, params = in_precision((F, params), gaussians.means.dtype)
     rotation, scales = quat_to_matrix(gaussians.quats), jnp.exp(gaussians.log_scales)
     coloured_by_view = gaussians.sh.shape[1] > 1 and mode != "fixed"
     return Splats(

@@ -1,12 +1,13 @@
 """In 64-bit mode everything is computed in the precision of the Gaussians or particles that are given."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from pigjax.camera import orbit, unproject
-from pigjax.clamp import ClampParams
+from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.colliders import Plane, Sphere
 from pigjax.materials import Material
 from pigjax.matter import fit_grid
@@ -64,3 +65,12 @@ def test_matter_moves_in_the_precision_of_its_particles(x64, dtype):
     end, path, health = jax.jit(lambda p: rollout(p, grid, table, config, **steps))(start)
     assert precisions((end, path, health)) == {np.dtype(dtype)}
     assert precisions(deform(gaussians, end, ClampParams())) == {np.dtype(dtype)}
+
+
+@pytest.mark.parametrize("mode", ["aligned", "literal", "covariance", "fixed"])
+def test_the_clamp_has_the_precision_of_the_gaussians(x64, mode):
+    gaussians = ball(np.float32)
+    gaussians = eqx.tree_at(lambda g: g.sh, gaussians, jnp.zeros((60, 4, 3), jnp.float32))  # coloured by view
+    stretch = jnp.broadcast_to(jnp.diag(jnp.array([1.1, 1.0, 3.0])), (60, 3, 3))
+    assert stretch.dtype == np.float64
+    assert precisions(eigen_clamp(gaussians, stretch, ClampParams(), mode=mode)) == {np.dtype(np.float32)}
