@@ -2,6 +2,8 @@
 
 import importlib
 import json
+import shutil
+import tempfile
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,6 +19,7 @@ from pigjax.scene import load_scene
 from pigjax.splat import Gaussians
 from pigjax.study import load_study
 from pigjax.tune import Table, load_table
+from pigjax.tune.sweep import _Keep
 
 SIZE = (8, 6)  # of photos and masks [px]
 VIEWS = ("000", "001", "002")
@@ -360,8 +363,11 @@ def _rows(folder: Path) -> None:
 
 
 def _read_rows(folder: Path) -> Any:
-    keep = _found("pigjax.tune.sweep:_Keep")
-    return io.load_state(folder, 0) if keep is None else keep(folder, "s").read()
+    """In a copy, since damaged files are set aside."""
+    with tempfile.TemporaryDirectory() as copy:
+        keep = _Keep(shutil.copytree(folder, Path(copy) / "rows"))
+        keep.signature = "s"
+        return keep.read(6)
 
 
 def _labels(folder: Path) -> None:
