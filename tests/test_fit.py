@@ -292,7 +292,7 @@ def test_a_range_too_narrow_for_its_precision_is_told():
 def test_a_checkpoint_of_other_settings_is_refused(tmp_path, options):
     usual = {"steps": 4, "bounds": (-5.0, 5.0), "checkpoint": tmp_path / "c"}
     fit(lambda x: (x - 1) ** 2, jnp.asarray(0.0), 0.1, **usual)
-    with pytest.raises(InputError, match="(bounds|clip .*) changed"):
+    with pytest.raises(InputError, match=r"(bounds|clip .*) changed"):
         fit(lambda x: (x - 1) ** 2, jnp.asarray(0.0), 0.1, **usual | options)
 
 
