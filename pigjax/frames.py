@@ -13,7 +13,7 @@ from jax import lax
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
-from pigjax.arrays import everywhere
+from pigjax.arrays import everywhere, in_precision
 from pigjax.colliders import Collider
 from pigjax.contact import BodyContact
 from pigjax.errors import InputError
@@ -73,6 +73,8 @@ def run_frames(
     if config.integrator == "auto":
         raise InputError("SimConfig.integrator = 'auto' is undecided: take what choose_integrator finds.")
     kernel, dtype = KERNELS[config.kernel], particles.x.dtype
+    around = in_precision((box, table, dt, gravity, colliders, contact, start), dtype)
+    box, table, dt, gravity, colliders, contact, start = around
     grid = box.grid
     grouping = group_by_law(particles, table, grid, devices, apart=contact is not None)
     states, bodies = grouping.states, 1 if contact is None else contact.bodies
