@@ -6,11 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pigjax.boxes import Fit
 from pigjax.camera import orbit, unproject
 from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.colliders import Plane, Sphere
-from pigjax.materials import Material
-from pigjax.matter import fit_grid
+from pigjax.materials import Material, material_table
+from pigjax.matter import fit_grid, make_particles, vast_grid
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.particles import deform, seed_particles
 from pigjax.segmentation import lift_masks
@@ -74,3 +75,18 @@ def test_the_clamp_has_the_precision_of_the_gaussians(x64, mode):
     stretch = jnp.broadcast_to(jnp.diag(jnp.array([1.1, 1.0, 3.0])), (60, 3, 3))
     assert stretch.dtype == np.float64
     assert precisions(eigen_clamp(gaussians, stretch, ClampParams(), mode=mode)) == {np.dtype(np.float32)}
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_frame_has_the_precision_of_the_particles(x64, dtype):
+    """As scenes take it: table, domain and collider come from plain numbers, in float64."""
+    table = material_table([Material("neo_hookean", density=1000.0, young=1e4, poisson=0.3)])
+    x = np.random.default_rng(0).uniform(0.2, 0.4, (40, 3)).astype(dtype)
+    particles = make_particles(x, volume=1e-6, table=table)
+    floor = Plane(point=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]))
+    after, path, _ = Fit().frame(
+        particles, vast_grid(0.1), table, SimConfig(), 1, dt=jnp.asarray(1e-3), gravity=jnp.asarray([0.0, 0.0, -9.81]),
+        colliders=(floor,), contact=None, start=jnp.asarray(0.0), frames=1, substeps=2,
+    )  # fmt: skip
+    assert precisions((after, path)) == {np.dtype(dtype)}
+    np.testing.assert_allclose(after.v[:, 2].mean(), -9.81 * 2e-3, rtol=1e-3)
