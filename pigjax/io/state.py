@@ -1,6 +1,6 @@
 """State on disk: one `.npz` per frame, and checkpoints of any pytree, none of which is ever torn.
 
-A checkpoint is a line of JSON (parts of its provenance, SHA-256 of the rest) and the leaves as equinox writes them.
+A checkpoint is a line of JSON (parts of its provenance, SHA-256 of these and of the rest) and the leaves as equinox writes them.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def save_pytree(path: PathLike, tree: Any, *, parts: Parts | None = None) -> Non
     room = io.BytesIO()  # a disk that fills up meets one write of bytes
     eqx.tree_serialise_leaves(room, tree)
     payload = room.getvalue()
-    head = {"sha256": hashlib.sha256(payload).hexdigest(), "parts": dict(parts or {})}
+    head = {"sha256": _checksum(dict(parts or {}), payload), "parts": dict(parts or {})}
     with writing(path) as partial:
         partial.write_bytes(json.dumps(head).encode() + b"\n" + payload)
 
@@ -145,7 +145,7 @@ def load_pytree(path: PathLike, like: Tree, *, parts: Parts | None = None) -> Tr
         head, _, payload = path.read_bytes().partition(b"\n")
         told = json.loads(head)
         found = {str(name): str(value) for name, value in told["parts"].items()}
-        if told["sha256"] != hashlib.sha256(payload).hexdigest():
+        if told["sha256"] != _checksum(found, payload):
             raise ValueError("its checksum differs")
     if parts is not None:
         check_same(path, found, parts)
@@ -155,6 +155,10 @@ def load_pytree(path: PathLike, like: Tree, *, parts: Parts | None = None) -> Tr
         if file.read(1):
             raise ValueError("it holds more leaves")
         return tree
+
+
+def _checksum(parts: Parts, payload: bytes) -> str:
+    return hashlib.sha256(json.dumps(sorted(parts.items())).encode() + payload).hexdigest()
 
 
 def resumed(path: PathLike, like: Tree, *, parts: Parts, overwrite: bool = False) -> Tree | None:
