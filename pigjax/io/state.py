@@ -1,6 +1,7 @@
 """State on disk: one `.npz` per frame, and checkpoints of any pytree, none of which is ever torn.
 
-A checkpoint is a line of JSON (parts of its provenance, SHA-256 of these and of the rest) and the leaves as equinox writes them.
+A checkpoint is a line of JSON (parts of its provenance, SHA-256 of these and of the rest) and the leaves as equinox
+writes them.
 """
 
 from __future__ import annotations
