@@ -1,4 +1,4 @@
-"""What the command `pigjax` starts: Ctrl-C has its sentence from the first moment, while the libraries load."""
+"""Entry point of the command `pigjax`: Ctrl-C is answered from the first moment, while the libraries load."""
 
 from __future__ import annotations
 

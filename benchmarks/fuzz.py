@@ -1,7 +1,7 @@
 """Damage valid files of every kind that pigjax reads, and see that it reads them or answers with its own error.
 
     python benchmarks/fuzz.py --count 20000
-    python benchmarks/fuzz.py --seed 0 --only table.npz:17 --keep /tmp/one    # one input again, and its files
+    python benchmarks/fuzz.py --seed 0 --only table.npz:17 --keep one    # one input again, and its files
 
 A child process reads, with bounds on memory and time. A reader fails by an exception that is no InputError, by asking
 for more memory than the bound, by taking too long, or by ending the process. Same seed, same inputs.

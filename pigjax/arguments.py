@@ -1,4 +1,4 @@
-"""What public functions are given, held against their annotations: a wrong object is one clear sentence. Leaf."""
+"""Arguments of public functions checked against their annotations: a wrong object is one clear sentence. Leaf."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def array_field(*, limits: Any = None, **kwargs: Any) -> Any:
 
 
 def static_field(*, limits: Any = None, choices: Any = None, **kwargs: Any) -> Any:
-    """Field that sizes a shape or picks a branch; a new value compiles anew.
+    """Field that sizes a shape or picks a branch; a new value recompiles.
 
     `checks.check_fields` reads the `limits` of its number, or the `choices` that it has.
     """

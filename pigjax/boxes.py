@@ -1,4 +1,4 @@
-"""The part of the grid that a simulation needs, laid anew from frame to frame.
+"""The part of the grid that a simulation needs, re-fitted from frame to frame.
 
 The same matter costs the same in a small domain and in a vast one. On the host a box whose edge matter has reached
 means that the frame is computed again in a larger one; inside jit, grad and vmap its size is fixed (`SimConfig.box`).

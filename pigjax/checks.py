@@ -52,7 +52,7 @@ class Limits:
         return f"in {ends[0]}{self.low:g}, {self.high:g}{ends[1]}{self._unit}"
 
     def broken(self, value: Any) -> str | None:
-        """What a concrete number, or array of numbers, breaks: "must be > 0 m"; None where all are in range."""
+        """The rule ("must be > 0 m") that a concrete number or array of numbers breaks; None where all are in range."""
         try:
             wide = np.asarray(value, float)
         except OverflowError:

@@ -1,4 +1,4 @@
-"""The one room where splats and matter meet: particles seeded from Gaussians, and Gaussians posed by particles."""
+"""The module where splats and matter meet: particles seeded from Gaussians, and Gaussians posed by particles."""
 
 from __future__ import annotations
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -94,7 +93,7 @@ def reconstruct(
         previews: folder for a picture of the first held-out (or else training) view beside its photo, every
             `config.preview_every` steps.
         callback: told the progress every few dozen steps.
-        overwrite: begin anew where the checkpoint was made from something else, instead of refusing it.
+        overwrite: start over where the checkpoint was made from something else, instead of refusing it.
 
     Raises:
         StaleError: the checkpoint was made from other photos, cameras, masks, points or settings; it names which.
@@ -203,7 +202,7 @@ def provenance(views: io.Views, config: FitConfig, points: Any) -> dict[str, str
         {
             "settings": settings,
             "photos": io.digest(views.images, views.names, views.splits),
-            "cameras": io.digest(jax.tree.leaves(views.cameras), views.cameras.width, views.cameras.height),
+            "cameras": io.digest(views.cameras),
             "masks": io.digest(views.masks),
             "points": io.digest(points),
             "precision": str(jnp.result_type(float)),

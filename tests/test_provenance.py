@@ -132,10 +132,7 @@ def test_a_checkpoint_of_other_parts_is_refused_and_a_damaged_one_is_set_aside(t
         path.write_bytes(damaged)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            try:
-                assert io.resumed(path, tree, parts={"a": "1"}) is None
-            except StaleError:  # the bit was one of the parts
-                assert at < whole.index(b"\n")
+            assert io.resumed(path, tree, parts={"a": "1"}) is None
 
 
 SEARCHES = [
@@ -210,7 +207,7 @@ def test_a_killed_search_goes_on_as_if_unbroken_whatever_else_draws_numbers(tmp_
 
     with pytest.raises(Killed):
         seek(tmp_path / "b", evaluations=30, callback=kill)
-    np.random.seed(0)  # noqa: NPY002
+    np.random.seed(0)  # noqa: NPY002 - the state that all of NumPy shares is what must not matter
     broken, resumed = seek(tmp_path / "b", evaluations=30)
     np.testing.assert_array_equal(whole["x"], broken["x"])
     np.testing.assert_array_equal(history.loss, resumed.loss)

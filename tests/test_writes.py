@@ -113,7 +113,7 @@ def test_a_victim_beside_the_output_folder_is_untouched(segmenting, tmp_path):
     assert (tmp_path / "out" / "objects" / "002_red_blue_cup.ply").is_file()
 
 
-@pytest.mark.parametrize("name", ["../x", "/tmp/x", "a/../../x", "", "..\\x"])
+@pytest.mark.parametrize("name", ["../x", "/x/y", "a/../../x", "", "..\\x"])
 def test_masks_are_not_written_out_of_their_folder(tmp_path, name):
     with pytest.raises(InputError, match=r"a view named .* leads out of it"):
         io.save_masks(tmp_path / "masks", [name], np.zeros((1, 2, 2), int))

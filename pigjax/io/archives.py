@@ -24,7 +24,7 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r")  # how a text begins that a spreadsh
 
 
 class ArrayHeader(NamedTuple):
-    """What an archive says of an array before the array is read."""
+    """Shape and type of an array, read before the array itself."""
 
     shape: tuple[int, ...]
     dtype: np.dtype

@@ -182,7 +182,7 @@ def write_toml(path: PathLike, content: Any) -> None:
 def output_folder(path: PathLike, *, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Path:
     """The folder for results, made where it is missing and freed of the temporary files of killed processes.
 
-    Called before the work begins, it tells of a place that cannot be written before hours are spent.
+    Commands call it first, so that a place that cannot be written is refused before the work begins.
 
     Args:
         path: the folder.
@@ -312,7 +312,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _said(error: BaseException) -> str:
-    """What the system says, without the path, which the message names."""
+    """Message of the operating system without the path."""
     return (error.strerror if isinstance(error, OSError) else None) or _reason(error)
 
 

@@ -115,7 +115,7 @@ def open_rgb(
 
 
 def turned_by_exif(path: PathLike) -> bool:
-    """Whether EXIF asks to turn or mirror a picture in a way that its size does not tell.
+    """Whether EXIF asks to turn or mirror a picture, and the picture's size does not show whether that was done.
 
     Raises:
         MissingFileError: there is no such file.

@@ -138,7 +138,7 @@ def _convert(content: Any, kind: Any, path: Path) -> Any:
 
 
 def _own(raw: dict[str, Any]) -> list[dict[str, Any]]:
-    """What frames say themselves; null says nothing."""
+    """Fields of a frame that have a value."""
     return [{key: value for key, value in frame.items() if value is not None} for frame in raw["frames"]]
 
 

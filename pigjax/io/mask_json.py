@@ -193,7 +193,7 @@ def _object_id(value: Any, where: str) -> int:
     if number >= ID_LIMIT:
         raise InputError(
             f"{where} is {number}; ids of objects must be below 2³¹: choose an id_field that numbers objects, such as"
-            " 'category_id', or number them anew."
+            " 'category_id', or renumber them."
         )
     return number
 

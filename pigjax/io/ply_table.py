@@ -59,7 +59,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """What a PLY file says about itself."""
+    """Header of a PLY file."""
 
     kind: str  # "ascii", "binary_little_endian" or "binary_big_endian"
     elements: tuple[Element, ...]

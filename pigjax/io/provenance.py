@@ -1,4 +1,4 @@
-"""What a result was made from, by content: one place decides for all commands whether old results may be used again.
+"""Provenance of results by content: one place decides for all commands whether old results may be used again.
 
 A result is described by its parts: a name for each thing it depends on ("simulation.dx", "photos", "loss"), and that
 thing's value, or a digest of its content. Folders keep them in `provenance.json`, checkpoints in their first line.

@@ -163,7 +163,7 @@ def _checksum(parts: Parts, payload: bytes) -> str:
 
 
 def resumed(path: PathLike, like: Tree, *, parts: Parts, overwrite: bool = False) -> Tree | None:
-    """What a checkpoint holds; None where there is none, or where it is damaged, so that all is computed again. Host.
+    """The tree of a checkpoint; None where there is none or it is damaged, so that all is computed again. Host.
 
     A damaged file is told in a warning and moved aside, to the same name with ".damaged".
 

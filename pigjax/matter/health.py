@@ -17,7 +17,7 @@ _NAMED = 3  # members of a batch that a message describes
 
 
 class StepHealth(eqx.Module):
-    """What went wrong in a step, as data.
+    """Problems of a step, as data.
 
     One meaning everywhere: where `is_bad` holds, `raise_if_bad` raises, `SimConfig.stop` stops, `problems` says why.
     `is_broken` is the part of it after which the numbers are not to be used. Matter that met a wall is told in

@@ -20,7 +20,7 @@ class Section(Struct, forbid_unknown_fields=True, frozen=True):
     """A table of a file. Its fields' annotations hold types, choices and `Limits`."""
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
-        """What must hold between fields: the field to name, whether it holds, and the rule in words."""
+        """Rules between fields: the field to name, whether it holds, and the rule in words."""
         return ()
 
 
@@ -74,7 +74,7 @@ def limits_of(kind: Any) -> Limits:
 
 
 def wanted(kind: Any) -> str:
-    """What a field of a type takes, in words."""
+    """Values that a field of a type takes, in words."""
     kind = _bare(kind)
     origin, args = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):

@@ -324,12 +324,11 @@ def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
         settings["input"].pop(name)
     views = inputs.views
     content = {
-        "Gaussians": jax.tree.leaves(inputs.gaussians),
-        "cameras": None if views is None else jax.tree.leaves(views.cameras),
+        "Gaussians": inputs.gaussians,
+        "cameras": None if views is None else views.cameras,
         "photos": None if views is None else (views.images, views.names, views.splits),
         "masks": None if views is None else views.masks,
         "ids of the objects": inputs.ids,
-        "precision": str(jnp.result_type(float)),
     }
-    digested = {name: value if isinstance(value, str) else io.digest(value) for name, value in content.items()}
-    return io.parts_of({"": settings, "input files": digested})
+    digests = {name: io.digest(value) for name, value in content.items()}
+    return io.parts_of({"": settings, "input files": digests, "precision": str(jnp.result_type(float))})

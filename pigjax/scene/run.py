@@ -106,7 +106,7 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: 
 
 
 def _mark(scene: Scene, inputs: Inputs) -> str | None:
-    """What tells the Gaussians of labels; nothing where positions are not those of the file."""
+    """Digest of the Gaussians that labels belong to; None where an origin was subtracted from their positions."""
     return None if scene.input.origin is not None else io.digest_of_scene(inputs.gaussians)
 
 
@@ -165,8 +165,6 @@ def _simulate(
         warnings.warn(f"{folder}: states of {len(missing)} frames are missing or damaged; made again.", stacklevel=2)
     report.modelled["integrator"] = config.integrator
     dtype = particles.x.dtype
-    if saved is not None and not repaired:
-        fit.remember(saved[2])
     todo = [*range(1, repaired + 1), *range(last + 1, frames + 1)]
     for frame in todo:
         tell("simulate", frame - 1, frames)
@@ -199,6 +197,8 @@ def _simulate(
             _save(folder, frame, particles, record, key)
         if frame > last:
             _checkpoint(checkpoint, frame, particles, fit, parts)
+    if saved is not None and last == frames:
+        fit.remember(saved[2])
     tell("simulate", frames, frames)
     records = _records(folder, frames, key)
     most = max((int(record["substeps"]) for frame, record in records.items() if frame), default=first)
@@ -210,7 +210,7 @@ def _simulate(
 
 
 def _records(folder: Path, frames: int, key: str) -> dict[int, Record]:
-    """What the states on disk hold of the health of each frame."""
+    """Health of each frame, from the states on disk."""
     records: dict[int, Record] = {}
     for frame in range(frames + 1):
         state = io.load_state(folder, frame, signature=key, prefix=MARK)

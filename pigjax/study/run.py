@@ -93,7 +93,7 @@ def tune_study(
         study: as `load_study` gives it.
         out_dir: folder for the results, made if it is missing.
         progress: told steps done, steps to do, and the loss in words.
-        overwrite: begin anew where the checkpoint belongs to something else, instead of refusing it.
+        overwrite: start over where the checkpoint belongs to something else, instead of refusing it.
 
     Raises:
         StaleError: `out_dir` holds the search of another study, scene, objective or other files; it names what changed.

@@ -77,7 +77,7 @@ def fit(
         every: steps between checkpoints.
         mark: what the loss depends on beside its code, what it closes over and `shared`, as a mapping by name or any
             value: files that it reads, for example.
-        overwrite: begin anew where the checkpoint belongs to another search, instead of refusing it.
+        overwrite: start over where the checkpoint belongs to another search, instead of refusing it.
 
     Returns:
         The best parameters met, and the history.
