@@ -1,4 +1,4 @@
-"""Steps in a row with a reverse-mode rule that keeps few states: blocks are recomputed and back-propagated step by step.
+"""Steps in a row with a reverse-mode rule that keeps few states: blocks are recomputed and back-propagated by steps.
 
 Kept are the states at the beginnings of blocks, and those within one block at a time. A step is taken in two halves,
 and what lies between them is kept beside the states of a block, so that to rewind a step neither half is computed anew.
