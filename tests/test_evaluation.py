@@ -281,7 +281,7 @@ def test_prompts_masks_labels_and_reference_may_be_given(tmp_path):
         tmp_path / "labels.npz", object_id=object_id, votes=np.zeros((len(object_id), 1)), confidence=0.0 * object_id
     )
     (tmp_path / "test_mask/1/near.png").unlink()
-    scores = run(tmp_path, "lerf-mask", "--labels", tmp_path / "labels.npz", "--reference", "v3")
+    scores = run(tmp_path, "lerf-mask", "--labels", tmp_path / "labels.npz", "--reference", "v3", "--overwrite")
     assert scores["objects"] == {"far": 30, "near": None}
     assert scores["grounding"] == "best overlap with the truth in view v3"
     assert scores["levels"]["visible"]["mean_iou"] == pytest.approx(0.5)
@@ -296,7 +296,7 @@ def test_prompts_masks_labels_and_reference_may_be_given(tmp_path):
         tracks[VIEWS.index(view)] = {k: {"size": c["size"], "counts": c["counts"].decode()} for k, c in coded.items()}
     (tmp_path / "tracks.json").write_text(json.dumps(tracks))
     (tmp_path / "names.json").write_text('{"1": "far", "2": "near"}')
-    scores = run(tmp_path, "lerf-mask", "--masks", tmp_path / "tracks.json")
+    scores = run(tmp_path, "lerf-mask", "--masks", tmp_path / "tracks.json", "--overwrite")
     assert scores["objects"] == {"far": 2, "near": 1}
     assert scores["levels"]["visible"]["mean_iou"] == pytest.approx(1.0)
 

@@ -18,7 +18,7 @@ from pigjax.cli import app
 from pigjax.errors import SceneError
 from pigjax.scene import load_scene, scene_from
 from pigjax.scene.accuracy import LEVELS
-from pigjax.scene.plan import make_cameras, read_inputs, render_config, signature
+from pigjax.scene.plan import make_cameras, provenance, read_inputs, render_config
 from pigjax.splat import RenderConfig
 
 EXAMPLE = Path(__file__).parents[1] / "examples/tabletop/scene.toml"
@@ -42,7 +42,8 @@ def test_standard_is_what_a_scene_without_the_word_is(values):
     assert plain == named == scene_of(values, accuracy="standard")
     assert plain.simulation.dx == values["simulation"]["dx"]
     assert (plain.simulation.cfl, plain.simulation.kernel, plain.simulation.particles_per_cell) == (0.4, "quadratic", 8)
-    assert signature(plain) == signature(named)
+    inputs = read_inputs(plain)
+    assert provenance(plain, inputs) == provenance(named, inputs)
     config = render_config(plain)
     assert config == RenderConfig(bands=config.bands)
 
@@ -77,8 +78,9 @@ def test_the_argument_wins_over_the_file(tmp_path):
 def test_states_belong_to_the_physics_not_to_the_word(values):
     standard, draft = scene_of(values), scene_of(values, accuracy="draft")
     same_matter = scene_of(values, accuracy="draft", simulation={"dx": 0.012 / LEVELS["draft"].coarsening})
-    assert signature(draft) != signature(standard)
-    assert signature(scene_of(values, drawing={"sh_degree": 0})) == signature(standard)
+    inputs = read_inputs(standard)
+    assert provenance(draft, inputs) != provenance(standard, inputs)
+    assert provenance(scene_of(values, drawing={"sh_degree": 0}), inputs) == provenance(standard, inputs)
     assert same_matter.simulation.dx == pytest.approx(standard.simulation.dx)
 
 
