@@ -13,12 +13,12 @@ import numpy as np
 from PIL import Image
 
 from pigjax import io
-from pigjax.errors import InputError
+from pigjax.core.errors import InputError
 from pigjax.scene import load_scene
 from pigjax.splat import Gaussians
 from pigjax.study import load_study
-from pigjax.tune import Table, load_table
-from pigjax.tune.sweep import _Keep
+from pigjax.study.optimize import Table, load_table
+from pigjax.study.optimize.sweep import _Keep
 
 SIZE = (8, 6)  # of photos and masks [px]
 VIEWS = ("000", "001", "002")
@@ -377,7 +377,7 @@ def _labels(folder: Path) -> None:
 
 
 def _read_labels(folder: Path) -> Any:
-    read = _found("pigjax.io:load_labels", "pigjax.io.labels:load_labels", "pigjax.scene.evaluate:_read_labels")
+    read = _found("pigjax.io:load_labels", "pigjax.io.labels:load_labels", "pigjax.cli.evaluating:_read_labels")
     return read(folder / "labels.npz", 4)
 
 

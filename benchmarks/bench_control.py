@@ -19,7 +19,7 @@ from _timing import measure, use_host_devices
 from pigjax import io
 from pigjax.study import experiment, load_study
 from pigjax.study.objectives import objective_of
-from pigjax.tune import Bounds, fit, search
+from pigjax.study.optimize import Bounds, fit, search
 
 STUDIES = Path(__file__).parents[1] / "examples" / "studies"
 MEDIA = Path(__file__).parents[1] / "docs" / "media"

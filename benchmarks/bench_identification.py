@@ -24,7 +24,7 @@ from _timing import measure, use_host_devices
 from pigjax import io
 from pigjax.study import Experiment, experiment, load_study
 from pigjax.study.objectives import pyramid_error
-from pigjax.tune import Bounds, fit, search
+from pigjax.study.optimize import Bounds, fit, search
 
 STUDIES = Path(__file__).parents[1] / "examples" / "studies"
 MEDIA = Path(__file__).parents[1] / "docs" / "media"

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from _timing import machine
 
-from pigjax.colliders import Plane
-from pigjax.materials import Material, material_table
-from pigjax.matter import Grid, make_particles
 from pigjax.mls_mpm import SimConfig, choose_integrator, choose_substeps, rollout
+from pigjax.mpm import Grid, make_particles
+from pigjax.mpm.colliders import Plane
+from pigjax.mpm.materials import Material, material_table
 
 DX, FRAMES, FRAME_DT = 1 / 16, 4, 1 / 40
 GRAVITY = (0.0, 0.0, -9.8)

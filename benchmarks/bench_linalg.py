@@ -1,4 +1,4 @@
-"""Nanoseconds per 3x3 matrix and relative error, pigjax.linalg beside LAPACK: `python benchmarks/bench_linalg.py`."""
+"""Nanoseconds per 3x3 matrix and relative error, beside LAPACK: `python benchmarks/bench_linalg.py`."""
 
 import argparse
 import statistics
@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pigjax import linalg
+from pigjax.core import linalg
 
 
 def lapack_polar(matrix):

@@ -24,14 +24,14 @@ from _profile import seconds_by_scope
 from _timing import machine, use_host_devices
 from tradeoff.points import in_turn
 
-from pigjax.boxes import Fit, whole
-from pigjax.colliders import Plane
-from pigjax.contact import BodyContact
-from pigjax.frames import run_frames
-from pigjax.materials import LAWS, Material, material_table
-from pigjax.matter import Grid, fit_grid, make_particles
 from pigjax.mls_mpm import SimConfig, rollout
-from pigjax.sleep import Sleep, Sleeper
+from pigjax.mpm import Grid, fit_grid, make_particles
+from pigjax.mpm.active_grid import Fit, whole
+from pigjax.mpm.colliders import Plane
+from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.materials import LAWS, Material, material_table
+from pigjax.mpm.program import run_frames
+from pigjax.mpm.sleep import Sleep, Sleeper
 
 DT = 1e-4  # the rivals' step
 ELASTIC = {"young": 1e5, "poisson": 0.2}

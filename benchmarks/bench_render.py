@@ -22,10 +22,10 @@ from _timing import machine, measure, use_host_devices
 from jax import lax
 
 from pigjax import Gaussians, RenderConfig, look_at, render, stack_cameras
-from pigjax.bands import replicate
-from pigjax.lists import front_to_back, list_pass
 from pigjax.splat import as_splats, blend_config, colours, project_splats
-from pigjax.tiles import blend
+from pigjax.splatting.binning import front_to_back, list_pass
+from pigjax.splatting.compositor import blend
+from pigjax.splatting.sharding import replicate
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--rows", nargs="*", default=["1000:256", "10000:256", "10000:512", "100000:256", "100000:512"],

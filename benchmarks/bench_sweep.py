@@ -24,10 +24,10 @@ from _timing import machine, use_host_devices
 from jax.sharding import Mesh
 
 from pigjax import ClampParams, Material, SimConfig, load_scene, material_table, psnr, render, rollout, sweep
-from pigjax.colliders import Plane
-from pigjax.linalg import svd
-from pigjax.matter import Grid, make_particles, vast_grid
-from pigjax.particles import at_frame, deform
+from pigjax.core.linalg import svd
+from pigjax.coupling.particles import at_frame, deform
+from pigjax.mpm import Grid, make_particles, vast_grid
+from pigjax.mpm.colliders import Plane
 from pigjax.scene.plan import make_cameras, make_plan, read_inputs, segment
 
 TABLETOP = Path(__file__).parents[1] / "examples" / "tabletop" / "scene.toml"

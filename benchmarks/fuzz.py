@@ -152,7 +152,7 @@ def _read_one(reader, folder, rng, others):
     """Damage a file of the folder, read, and put the file back."""
     from _damage import damaged
 
-    from pigjax.errors import InputError
+    from pigjax.core.errors import InputError
 
     file, change = _damage_of(reader, folder, rng, others, damaged)
     before = file.read_bytes()

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from pigjax.arguments import checked
-from pigjax.arrays import array_field, in_precision, static_field
-from pigjax.checks import Limits, check_fields, shown
-from pigjax.errors import InputError
-from pigjax.linalg import aligned_svd, matmul3, polar, quat_to_matrix, svd
+from pigjax.core.arguments import checked
+from pigjax.core.arrays import array_field, in_precision, static_field
+from pigjax.core.checks import Limits, check_fields, shown
+from pigjax.core.errors import InputError
+from pigjax.core.linalg import aligned_svd, matmul3, polar, quat_to_matrix, svd
 from pigjax.splat import Gaussians, Splats
 
 _PROPER_SIGNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))

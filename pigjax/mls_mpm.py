@@ -18,14 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pigjax.arguments import checked
-from pigjax.boxes import LARGEST, run_in_boxes, run_in_one_box
-from pigjax.colliders import Collider
-from pigjax.contact import BodyContact
-from pigjax.errors import InputError
-from pigjax.materials import MaterialTable
-from pigjax.matter import Grid, Health, Particles, SimConfig, StepHealth, Trajectory, fit_grid
-from pigjax.sleep import Sleep, Sleeper
+from pigjax.core.arguments import checked
+from pigjax.core.errors import InputError
+from pigjax.mpm import Grid, Health, Particles, SimConfig, StepHealth, Trajectory, fit_grid
+from pigjax.mpm.active_grid import LARGEST, run_in_boxes, run_in_one_box
+from pigjax.mpm.colliders import Collider
+from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.materials import MaterialTable
+from pigjax.mpm.sleep import Sleep, Sleeper
 
 __all__ = ["SimConfig", "choose_integrator", "choose_substeps", "rollout", "stable_dt", "step"]
 _COST_OF_IMPLICIT = 400  # explicit steps in the time of an implicit one, by benchmarks/bench_implicit.py

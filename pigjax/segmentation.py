@@ -13,11 +13,10 @@ from jax import lax
 from jaxtyping import Array, Float, Int, Integer, Num
 from scipy.spatial import cKDTree
 
-from pigjax.arguments import checked
-from pigjax.arrays import array_field, in_precision
-from pigjax.camera import Camera
-from pigjax.chunks import static_capacity
-from pigjax.errors import InputError
+from pigjax.core.arguments import checked
+from pigjax.core.arrays import array_field, in_precision
+from pigjax.core.camera import Camera
+from pigjax.core.errors import InputError
 from pigjax.sightings import Scalar, check_masks, draw, front_of, is_known, pixel_under
 from pigjax.splat import (
     Gaussians,
@@ -29,7 +28,8 @@ from pigjax.splat import (
     project_splats,
     required_capacity,
 )
-from pigjax.tile_walks import credits_of_candidates, soft_surface_depth
+from pigjax.splatting.contributions import credits_of_candidates, soft_surface_depth
+from pigjax.splatting.scan_compositor import static_capacity
 
 _TIED_IDS = 4  # of more ids with equal votes, the lowest four compete
 _MOST_MEMORY = 2**35  # [bytes] of votes; more come from ids that number annotations rather than objects

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from pigjax.camera import Camera, project
-from pigjax.errors import InputError
+from pigjax.core.camera import Camera, project
+from pigjax.core.errors import InputError
 from pigjax.splat import RenderConfig, Splats, near_plane, render
 
 Scalar = Float[Array, ""] | float

@@ -12,16 +12,16 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from pigjax.arguments import checked
-from pigjax.arrays import array_field, einsum, in_precision, static_field
-from pigjax.bands import collect, spread
-from pigjax.camera import Camera, require_one, stack_cameras, to_camera
-from pigjax.checks import LARGEST_WHOLE, Limits, check_fields
-from pigjax.errors import InputError
-from pigjax.extent import Extent, scene_extent, typical_distance
-from pigjax.linalg import quat_to_matrix, safe_normalize, svd
-from pigjax.lists import BlendConfig, Projected, count_pairs, slots_of, tile_boxes
-from pigjax.tiles import blend
+from pigjax.core.arguments import checked
+from pigjax.core.arrays import array_field, einsum, in_precision, static_field
+from pigjax.core.camera import Camera, require_one, stack_cameras, to_camera
+from pigjax.core.checks import LARGEST_WHOLE, Limits, check_fields
+from pigjax.core.errors import InputError
+from pigjax.core.extent import Extent, scene_extent, typical_distance
+from pigjax.core.linalg import quat_to_matrix, safe_normalize, svd
+from pigjax.splatting.binning import BlendConfig, Projected, count_pairs, slots_of, tile_boxes
+from pigjax.splatting.compositor import blend
+from pigjax.splatting.sharding import collect, spread
 
 
 class Gaussians(eqx.Module):

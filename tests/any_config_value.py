@@ -7,15 +7,15 @@ import jax
 import numpy as np
 
 from pigjax.clamp import ClampParams
-from pigjax.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
-from pigjax.contact import BodyContact
-from pigjax.errors import InputError
-from pigjax.fitting import FitConfig
-from pigjax.materials import Material
-from pigjax.matter import SimConfig
-from pigjax.sleep import Sleep
+from pigjax.core.errors import InputError
+from pigjax.mpm import SimConfig
+from pigjax.mpm.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
+from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.materials import Material
+from pigjax.mpm.sleep import Sleep
+from pigjax.reconstruction.train import FitConfig
 from pigjax.splat import RenderConfig
-from pigjax.tune import Bounds
+from pigjax.study.optimize import Bounds
 
 HUGE = (1e30, 2**40, 10**400)
 VALUES = (math.nan, math.inf, -math.inf, -1, 0, *HUGE, 1e-45, "text", [], {}, None, True, (math.nan,) * 3)

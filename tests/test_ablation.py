@@ -8,7 +8,7 @@ from ablation.reference import EXACT, _components, _lattice, render_parts, split
 from ablation.scores import holes, needles
 
 import pigjax as pj
-from pigjax.camera import look_at
+from pigjax.core.camera import look_at
 from pigjax.splat import Splats
 
 SIZE = 0.04  # [m] of parts; the Gaussians' largest scales are 0.12

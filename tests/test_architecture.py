@@ -1,4 +1,4 @@
-"""The house stands as DESIGN says: imports point down only, importing is cheap and changes nothing."""
+"""Imports point down only, importing is cheap and changes nothing."""
 
 import ast
 import subprocess
@@ -10,75 +10,74 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "pigjax"
 
-# every module may import what stands on a lower floor only
-FLOORS = [
-    {"errors", "arrays", "rewind"},
-    {"checks", "arguments"},
-    {"linalg", "krylov", "metrics", "lists", "extent"},
-    {"camera", "materials", "bands", "footprints"},
-    {"chunks"},
-    {"tiles", "colliders", "transfers", "contact"},
-    {"splat", "matter", "passes"},
-    {"tile_walks", "clamp", "shells", "relocation", "starts", "overlay", "substep", "io", "sightings"},
-    {"filling", "tangents", "fitting"},
-    {"implicit"},
-    {"frames"},
-    {"boxes"},
-    {"sleep"},
-    {"mls_mpm"},
-    {"segmentation", "particles", "solids", "reconstruct", "pruning"},
-    {"association", "editing", "evaluation"},
-    {"scene", "tune"},
+# A package may import its own modules and what stands on a lower layer.
+LAYERS = [
+    {"core"},
+    {"io"},
+    {"splatting", "mpm"},
+    {"splat", "mls_mpm"},
+    {"clamp", "segmentation"},
+    {"reconstruction", "objects", "coupling"},
+    {"scene"},
     {"study"},
     {"cli"},
     {"__main__"},
 ]
-FLOOR_OF = {module: floor for floor, modules in enumerate(FLOORS) for module in modules}
-# the two worlds meet in particles.py and solids.py only
-SPLATS = {"splat", "lists", "footprints", "chunks", "bands", "tiles", "tile_walks", "clamp", "segmentation"}
-SPLATS |= {"sightings", "association", "fitting"}
-SPLATS |= {"starts", "relocation", "reconstruct", "filling", "shells", "pruning", "editing", "evaluation"}
-MATTER = {
-    "matter",
-    "mls_mpm",
-    "boxes",
-    "sleep",
-    "frames",
-    "implicit",
-    "krylov",
-    "tangents",
-    "substep",
-    "passes",
-    "rewind",
-    "transfers",
-    "materials",
-    "colliders",
-}
+LAYER_OF = {package: layer for layer, packages in enumerate(LAYERS) for package in packages}
 
 
 def imports_of(path):
+    """Modules of pigjax that a file names at its top or within its functions."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "pigjax":
-            parts = node.module.split(".")
-            yield from [parts[1]] if len(parts) > 1 else [alias.name for alias in node.names]
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                yield inner if inner in NAMES else node.module
         elif isinstance(node, ast.Import):
-            yield from (alias.name.split(".")[1] for alias in node.names if alias.name.startswith("pigjax."))
+            yield from (alias.name for alias in node.names if alias.name.startswith("pigjax."))
 
 
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 
 
-def room(path):
-    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+def name_of(path):
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+NAMES = {name_of(path): path for path in MODULES}
+
+
+def package_of(name):
+    return name.split(".")[1]
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_imports_point_down(path):
-    here = room(path)
-    for other in set(imports_of(path)) - {here}:
-        assert FLOOR_OF[other] < FLOOR_OF[here], f"{here} must not import {other}"
-        assert not (here in SPLATS and other in MATTER), f"{here} is of the splats, {other} of matter"
-        assert not (here in MATTER and other in SPLATS), f"{here} is of matter, {other} of the splats"
+    here = package_of(name_of(path))
+    for other in {package_of(name) for name in imports_of(path)} - {here}:
+        assert LAYER_OF[other] < LAYER_OF[here], f"{here} must not import {other}"
+
+
+def test_no_module_imports_itself_by_way_of_others():
+    below = {name: {other for other in imports_of(path) if other != name} for name, path in NAMES.items()}
+    done: set[str] = set()
+
+    def visit(name, path):
+        assert name not in path, " imports ".join([*path[path.index(name) :], name])
+        if name not in done:
+            for other in below.get(name, ()):
+                visit(other, [*path, name])
+            done.add(name)
+
+    for name in below:
+        visit(name, [])
+
+
+def test_the_top_of_the_package_has_fourteen_entries():
+    entries = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()}
+    assert entries - {"__init__", "__main__"} == set(LAYER_OF) - {"__main__"}
+    assert len(entries - {"__init__", "__main__"}) == 14
 
 
 # what opens, writes, makes or removes files, as a function or method of any module
@@ -90,7 +89,7 @@ TOUCHES_OF |= {"pickle": {"dump", "load"}, "json": {"dump", "load"}, "tomllib": 
 
 def test_only_io_touches_files():
     for path in MODULES:
-        if room(path) == "io":
+        if package_of(name_of(path)) == "io":
             continue
         for node in ast.walk(ast.parse(path.read_text())):
             if not isinstance(node, ast.Call):
@@ -112,7 +111,7 @@ CONTRIBUTING = PACKAGE.parent / "CONTRIBUTING.md"
 def layers_as_text():
     """The table of layers that CONTRIBUTING.md holds: `python tests/test_architecture.py` writes it there."""
     rows = ["| layer | module | what it is |", "|---|---|---|"]
-    for layer, modules in reversed(list(enumerate(FLOORS))):
+    for layer, modules in reversed(list(enumerate(LAYERS))):
         for module in sorted(modules):
             package = PACKAGE / module / "__init__.py"
             file = package if package.is_file() else PACKAGE / f"{module}.py"
@@ -131,9 +130,9 @@ def test_products_keep_full_precision():
     for path in MODULES:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.BinOp | ast.AugAssign) and isinstance(node.op, ast.MatMult):
-                assert room(path) in host, f"{path}:{node.lineno}: use arrays.matmul"
+                assert package_of(name_of(path)) in host, f"{path}:{node.lineno}: use arrays.matmul"
             if isinstance(node, ast.Attribute) and node.attr in rounded and ast.unparse(node.value) == "jnp":
-                assert room(path) == "arrays", f"{path}:{node.lineno}: use arrays.{node.attr}"
+                assert package_of(name_of(path)) == "arrays", f"{path}:{node.lineno}: use arrays.{node.attr}"
 
 
 def test_modules_are_short():

@@ -9,8 +9,8 @@ import pytest
 
 import pigjax
 from pigjax import io
-from pigjax.arguments import checked
-from pigjax.errors import InputError
+from pigjax.core.arguments import checked
+from pigjax.core.errors import InputError
 
 FUNCTIONS = [value for name in pigjax.__all__ if not inspect.isclass(value := getattr(pigjax, name))]
 FUNCTIONS += [io.read_image, io.write_image, io.read_video, io.contact_sheet]
@@ -73,8 +73,8 @@ def test_a_batch_of_cameras_where_one_is_needed_names_index_and_vmap(scene):
         lambda: pigjax.render(cloud, cameras),
         lambda: pigjax.surface_depth(cloud, cameras),
         lambda: pigjax.object_mask(cloud, labels, 1, cameras),
-        lambda: pigjax.camera.project(cloud.means, cameras),
-        lambda: pigjax.camera.unproject(jnp.ones((8, 8)), cameras),
+        lambda: pigjax.core.camera.project(cloud.means, cameras),
+        lambda: pigjax.core.camera.unproject(jnp.ones((8, 8)), cameras),
     ):
         with pytest.raises(InputError, match=r"is a batch of shape \(2,\).*camera\[0\].*vmap"):
             call()
@@ -88,7 +88,7 @@ def _intrinsics(camera):
 
 def test_arrays_of_any_kind_pass_and_lists_become_arrays():
     @checked
-    def norm(points: "pigjax.camera.Float[jax.Array, 'n 3']", *, scale: float = 1.0):
+    def norm(points: "pigjax.core.camera.Float[jax.Array, 'n 3']", *, scale: float = 1.0):
         return scale * jnp.linalg.norm(points)
 
     for points in (jnp.ones((2, 3)), np.ones((2, 3)), [[1.0, 1, 1], [1, 1, 1]]):

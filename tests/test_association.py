@@ -8,9 +8,9 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from segmentation.association import score, spoil
 from segmentation.tabletop import load_tabletop
 
-from pigjax.association import associate_masks, compact_ids
-from pigjax.camera import orbit
-from pigjax.errors import InputError
+from pigjax.core.camera import orbit
+from pigjax.core.errors import InputError
+from pigjax.objects.association import associate_masks, compact_ids
 from pigjax.segmentation import lift_masks
 from pigjax.splat import Gaussians
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pigjax.camera import Camera, interpolate_path, look_at, orbit, project, stack_cameras, unproject
-from pigjax.errors import InputError
+from pigjax.core.camera import Camera, interpolate_path, look_at, orbit, project, stack_cameras, unproject
+from pigjax.core.errors import InputError
 
 
 def test_look_at_puts_the_target_in_the_middle_and_up_on_top():

@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 from test_scene import ball
 
 from pigjax import io
-from pigjax.camera import look_at, stack_cameras
-from pigjax.errors import InputError, SceneError
-from pigjax.materials import LIMITS, PRESETS, Parameters
+from pigjax.core.camera import look_at, stack_cameras
+from pigjax.core.errors import InputError, SceneError
+from pigjax.mpm.materials import LIMITS, PRESETS, Parameters
+from pigjax.mpm.transfers import KERNELS
 from pigjax.scene import load_scene, plan, scene_from
 from pigjax.scene.decode import Section, decode, numbers_of
 from pigjax.scene.schema import Scene, SimulationSpec
@@ -25,7 +26,6 @@ from pigjax.study import OBJECTIVES, load_study
 from pigjax.study.objectives import check_aim, objective_of
 from pigjax.study.run import _rows
 from pigjax.study.schema import OPTIONS, Study
-from pigjax.transfers import KERNELS
 
 VALUES = (math.nan, math.inf, -math.inf, -1, 0, 1e30, 2**40, 10**400, 1e-45, "text", [], {}, None, True, [math.nan] * 3)
 ROUND = {"start": [0, 0, 0], "end": [0, 0, 1], "radius": 0.1}

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pigjax.matter import inverse
-from pigjax.matter.chunks import order_of
+from pigjax.mpm import inverse
+from pigjax.mpm.layout import order_of
 
 
 @pytest.mark.parametrize("most", [3, 200, 2**31 - 1])

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pigjax.clamp import ClampParams, eigen_clamp
-from pigjax.errors import InputError
+from pigjax.core.errors import InputError
 from pigjax.splat import Gaussians
 
 EPS = np.finfo(np.float32).eps

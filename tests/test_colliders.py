@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pigjax.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
-from pigjax.errors import InputError
-from pigjax.materials import Material, material_table
-from pigjax.matter import Grid, make_particles
+from pigjax.core.errors import InputError
 from pigjax.mls_mpm import SimConfig, rollout
+from pigjax.mpm import Grid, make_particles
+from pigjax.mpm.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
+from pigjax.mpm.materials import Material, material_table
 
 DX = 1 / 16
 UP = np.array([0.0, 0.0, 1.0])

@@ -13,7 +13,7 @@ from baselines.surface_only import ids_by_members
 from comparison import scores
 from scipy.spatial.transform import Rotation
 
-from pigjax.colliders import Plane
+from pigjax.mpm.colliders import Plane
 
 RNG = np.random.default_rng(0)
 TURN, SHIFT = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix(), np.array([0.3, -0.2, 0.5])

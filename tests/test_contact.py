@@ -4,12 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pigjax.colliders import Plane
-from pigjax.contact import BodyContact
-from pigjax.errors import InputError
-from pigjax.materials import Material, material_table
-from pigjax.matter import Grid, make_particles
+from pigjax.core.errors import InputError
 from pigjax.mls_mpm import SimConfig, rollout
+from pigjax.mpm import Grid, make_particles
+from pigjax.mpm.colliders import Plane
+from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.materials import Material, material_table
 
 DX = 1 / 16
 TABLE = material_table([Material("neo_hookean", density=1000.0, young=2e4, poisson=0.3)])

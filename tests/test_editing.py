@@ -7,10 +7,10 @@ import pytest
 from typer.testing import CliRunner
 
 from pigjax import io
-from pigjax.camera import look_at
 from pigjax.cli import app
-from pigjax.editing import extract_object, hole_mask, remove_object
-from pigjax.errors import InputError
+from pigjax.core.camera import look_at
+from pigjax.core.errors import InputError
+from pigjax.objects.editing import extract_object, hole_mask, remove_object
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians
 

@@ -13,14 +13,14 @@ from scipy import ndimage
 from typer.testing import CliRunner
 
 from pigjax import io
-from pigjax.camera import Camera
 from pigjax.cli import app
-from pigjax.errors import InputError, MissingFileError
-from pigjax.evaluation import LEVELS, evaluate_labels, ground_prompts, pixel_ids, reference_view
+from pigjax.cli.evaluating import evaluate_files
+from pigjax.core.camera import Camera
+from pigjax.core.errors import InputError, MissingFileError
+from pigjax.core.metrics import MaskScores
 from pigjax.io import load_dataset, save_masks, save_ply, write_image
-from pigjax.metrics import MaskScores
-from pigjax.overlay import comparison_sheet
-from pigjax.scene.evaluate import evaluate_files
+from pigjax.objects.evaluation import LEVELS, evaluate_labels, ground_prompts, pixel_ids, reference_view
+from pigjax.objects.overlay import comparison_sheet
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians
 

@@ -7,19 +7,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pigjax.camera import Camera, orbit, stack_cameras
-from pigjax.errors import InputError
-from pigjax.extent import scene_extent
-from pigjax.fitting import FitConfig, noise_at
+from pigjax.cli.segmenting import describe_file
+from pigjax.cli.turntable import turntable
+from pigjax.core.camera import Camera, orbit, stack_cameras
+from pigjax.core.errors import InputError
+from pigjax.core.extent import scene_extent
+from pigjax.coupling.particles import bind, seed_particles
 from pigjax.io import read_image, save_ply
-from pigjax.materials import preset
-from pigjax.particles import bind, seed_particles
-from pigjax.relocation import shake
-from pigjax.scene.objects import describe_file
-from pigjax.scene.turntable import turntable
+from pigjax.mpm.materials import preset
+from pigjax.reconstruction.init import covering_sample, random_points, start_gaussians
+from pigjax.reconstruction.mcmc import shake
+from pigjax.reconstruction.train import FitConfig, noise_at
 from pigjax.segmentation import lift_masks
 from pigjax.splat import Gaussians, RenderConfig, extent_of, render
-from pigjax.starts import covering_sample, random_points, start_gaussians
 
 scales = st.floats(-4, 4).map(lambda power: 10.0**power)
 

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pigjax.errors import InputError, SimulationError
-from pigjax.materials import LAWS, Material, material_table, respond
-from pigjax.matter import Grid, SimConfig, fit_grid, make_particles, vast_grid
+from pigjax.core.errors import InputError, SimulationError
 from pigjax.mls_mpm import rollout, stable_dt
+from pigjax.mpm import Grid, SimConfig, fit_grid, make_particles, vast_grid
+from pigjax.mpm.materials import LAWS, Material, material_table, respond
 
 DX = 1 / 16
 FRAMES, SUBSTEPS = 4, 10

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from shapes import ball, box, make_gaussians, sphere, torus
 
-from pigjax.errors import InputError
-from pigjax.filling import fill_interior
-from pigjax.shells import shell_of, solid_of
+from pigjax.core.errors import InputError
+from pigjax.coupling.filling import fill_interior
+from pigjax.coupling.solid import shell_of, solid_of
 from pigjax.splat import Gaussians
 
 BALL = 4 / 3 * np.pi

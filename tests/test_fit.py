@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pigjax as pj
-from pigjax.errors import InputError, SimulationError
-from pigjax.tune import Bounds, fit, search
+from pigjax.core.errors import InputError, SimulationError
+from pigjax.study.optimize import Bounds, fit, search
 
 KINDS = {
     "free": Bounds(),

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from pigjax import io
-from pigjax.materials import PRESETS
+from pigjax.mpm.materials import PRESETS
 from pigjax.scene import load_scene
 
 FOLDER = Path(__file__).parents[1] / "examples" / "materials"

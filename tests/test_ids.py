@@ -12,11 +12,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from pigjax.camera import look_at, stack_cameras
-from pigjax.errors import InputError, SceneError
+from pigjax.core.camera import look_at, stack_cameras
+from pigjax.core.errors import InputError, SceneError
 from pigjax.io import id_named, load_masks, load_names
-from pigjax.overlay import colours_of, id_colours, id_image, overlay
-from pigjax.scene.lifting import lift
+from pigjax.objects.lifting import lift
+from pigjax.objects.overlay import colours_of, id_colours, id_image, overlay
 from pigjax.scene.plan import Inputs, _id_of, segment
 from pigjax.scene.schema import load_scene
 from pigjax.segmentation import lift_masks

@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pigjax.colliders import Plane
-from pigjax.errors import InputError
-from pigjax.materials import Material, material_table
-from pigjax.matter import Grid, make_particles
+from pigjax.core.errors import InputError
 from pigjax.mls_mpm import SimConfig, choose_integrator, choose_substeps, rollout
+from pigjax.mpm import Grid, make_particles
+from pigjax.mpm.colliders import Plane
+from pigjax.mpm.materials import Material, material_table
 
 DX = 1 / 16
 DOMAIN = Grid(jnp.zeros(3), jnp.asarray(DX), (16, 16, 16))

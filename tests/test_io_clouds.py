@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pigjax.errors import InputError
+from pigjax.core.errors import InputError
 from pigjax.io import load_cameras, load_gaussians, load_ply, load_points, origin_of, save_ply
 from pigjax.splat import Gaussians, as_splats
 

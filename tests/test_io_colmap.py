@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pigjax.camera import project
-from pigjax.errors import InputError, MissingFileError
+from pigjax.core.camera import project
+from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io import load_cameras, load_points, load_views
 
 MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pigjax.errors import InputError, MissingFileError
+from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io import load_gaussians, load_ply, save_ply
 from pigjax.splat import Gaussians, as_splats
 

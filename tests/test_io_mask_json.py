@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pycocotools import mask as coco
 from scipy import ndimage
 
-from pigjax.errors import InputError, MissingFileError
+from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io import load_masks, save_masks
 from pigjax.io.mask_json import Segment, _run_lengths, paint
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pigjax.errors import InputError, MissingFileError
+from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io import load_masks, save_masks
 
 IDS = np.array([[0, 1, 2], [3, 200, 255]], np.int32)

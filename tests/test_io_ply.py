@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pigjax.errors import InputError, MissingFileError
+from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io import load_ply, load_points, read_ply, save_ply
 from pigjax.splat import Gaussians
 

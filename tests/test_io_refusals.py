@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from pigjax.errors import InputError, MissingFileError
+from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io import load_cameras, load_views
 
 EYE = np.eye(4).tolist()

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from pigjax.errors import InputError, MissingFileError
+from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io import last_state, load_pytree, load_state, read_json, save_pytree, save_state, write_json
 
 ARRAYS = {"x": np.arange(6, dtype=np.float32).reshape(2, 3), "alive": np.array([True, False])}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pigjax.errors import InputError, MissingFileError
+from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io import contact_sheet, read_image, read_video, write_image, write_video
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pigjax.camera import project
-from pigjax.errors import InputError, MissingFileError
+from pigjax.core.camera import project
+from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io import load_cameras, load_points, load_views
 
 TABLETOP = Path(__file__).parents[1] / "examples" / "tabletop"

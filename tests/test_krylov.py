@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pigjax.krylov import conjugate_gradients, in_modes, precondition, stabilized_gradients
+from pigjax.mpm.implicit.krylov import conjugate_gradients, in_modes, precondition, stabilized_gradients
 
 SHAPE = (3, 4, 2)
 COUNT = 3 * int(np.prod(SHAPE))

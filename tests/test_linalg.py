@@ -12,7 +12,7 @@ import pytest
 import scipy.linalg
 from scipy.spatial.transform import Rotation
 
-from pigjax import linalg
+from pigjax.core import linalg
 
 EPS = np.finfo(np.float32).eps
 COUNT = 2000

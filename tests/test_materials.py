@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pigjax.errors import InputError
-from pigjax.materials import LAWS, PRESETS, Material, material_table, plasticine, preset, respond, snow
-from pigjax.materials.elastic import _first_invariant, left_stretch
-from pigjax.materials.fibres import fibre_direction
-from pigjax.materials.fluid import tait_pressure
-from pigjax.materials.foam import _relaxed, herschel_bulkley
-from pigjax.materials.plastic import drucker_prager, von_mises
+from pigjax.core.errors import InputError
+from pigjax.mpm.materials import LAWS, PRESETS, Material, material_table, plasticine, preset, respond, snow
+from pigjax.mpm.materials.elastic import _first_invariant, left_stretch
+from pigjax.mpm.materials.fibres import fibre_direction
+from pigjax.mpm.materials.fluid import tait_pressure
+from pigjax.mpm.materials.foam import _relaxed, herschel_bulkley
+from pigjax.mpm.materials.plastic import drucker_prager, von_mises
 
 MU, LAM = 4e4, 6e4
 YOUNG, POISSON = MU * (3 * LAM + 2 * MU) / (LAM + MU), LAM / 2 / (LAM + MU)

@@ -5,8 +5,8 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from pigjax.errors import InputError
-from pigjax.metrics import boundary_iou, mean_iou, psnr, score_masks, ssim
+from pigjax.core.errors import InputError
+from pigjax.core.metrics import boundary_iou, mean_iou, psnr, score_masks, ssim
 
 
 def images(seed=0, shape=(24, 31, 3)):

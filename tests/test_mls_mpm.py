@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
-from pigjax.colliders import Plane
-from pigjax.errors import InputError, SimulationError
-from pigjax.materials import Material, material_table, preset
-from pigjax.materials.fluid import tait_pressure
-from pigjax.matter import Grid, fit_grid, make_particles
+from pigjax.core.errors import InputError, SimulationError
 from pigjax.mls_mpm import SimConfig, choose_substeps, rollout, stable_dt, step
+from pigjax.mpm import Grid, fit_grid, make_particles
+from pigjax.mpm.colliders import Plane
+from pigjax.mpm.materials import Material, material_table, preset
+from pigjax.mpm.materials.fluid import tait_pressure
 
 DX = 1 / 16
 SIDE = 5  # particles

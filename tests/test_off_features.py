@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pigjax.colliders import Plane
-from pigjax.contact import BodyContact
-from pigjax.materials import LAWS, Material, Parameters, material_table, respond
-from pigjax.matter import Grid, group_by_law, make_particles
 from pigjax.mls_mpm import SimConfig, rollout
+from pigjax.mpm import Grid, group_by_law, make_particles
+from pigjax.mpm.colliders import Plane
+from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.materials import LAWS, Material, Parameters, material_table, respond
 
 DX = 1 / 8
 DOMAIN = Grid(jnp.zeros(3), jnp.asarray(DX), (10, 11, 12))

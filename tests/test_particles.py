@@ -6,10 +6,10 @@ import pytest
 from shapes import box, make_gaussians, sphere
 
 from pigjax.clamp import ClampParams
-from pigjax.errors import InputError
-from pigjax.materials import preset
-from pigjax.matter import Trajectory
-from pigjax.particles import at_frame, bind, deform, seed_particles
+from pigjax.core.errors import InputError
+from pigjax.coupling.particles import at_frame, bind, deform, seed_particles
+from pigjax.mpm import Trajectory
+from pigjax.mpm.materials import preset
 from pigjax.splat import as_splats
 
 BALL, CUBE, BACKGROUND = 1, 7, 40

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import pigjax as pj
 from pigjax import io
-from pigjax.errors import StaleError
+from pigjax.core.errors import StaleError
 
 SEED = 3
 

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from rounding import assert_same
 
-from pigjax import fitting, io
-from pigjax.camera import orbit
-from pigjax.errors import InputError
-from pigjax.linalg import matrix_to_quat
-from pigjax.reconstruct import FitConfig, random_points, reconstruct, start_gaussians
-from pigjax.relocation import relocate, shake, split_opacity
+from pigjax import io
+from pigjax.core.camera import orbit
+from pigjax.core.errors import InputError
+from pigjax.core.linalg import matrix_to_quat
+from pigjax.reconstruction import train as fitting
+from pigjax.reconstruction.mcmc import relocate, shake, split_opacity
+from pigjax.reconstruction.reconstruct import FitConfig, random_points, reconstruct, start_gaussians
 from pigjax.splat import Gaussians, render
 
 
@@ -138,8 +139,8 @@ def test_a_process_killed_outright_resumes_to_the_same_bytes(views, trained, tmp
 import os, signal, sys
 import jax, numpy as np
 from pigjax import io
-from pigjax.camera import orbit
-from pigjax.reconstruct import FitConfig, reconstruct
+from pigjax.core.camera import orbit
+from pigjax.reconstruction.reconstruct import FitConfig, reconstruct
 from pathlib import Path
 data = np.load({str(tmp_path / "views.npz")!r})
 cameras = orbit((0.0, 0.0, 0.0), radius=2.5, elevation=0.4, frames=12, focal=40.0, width=32, height=32)

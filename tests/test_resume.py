@@ -18,11 +18,11 @@ from typer.testing import CliRunner
 
 from pigjax import io
 from pigjax.cli import app
-from pigjax.errors import InputError, StaleError
+from pigjax.cli.evaluating import evaluate_files
+from pigjax.cli.segmenting import segment_files
+from pigjax.core.errors import InputError, StaleError
 from pigjax.scene import run as run_module
 from pigjax.scene import run_scene, scene_from
-from pigjax.scene.evaluate import evaluate_files
-from pigjax.scene.objects import segment_files
 from pigjax.study import load_study, sweep_study, tune_study
 
 SCENE = {

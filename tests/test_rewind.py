@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pigjax.colliders import Plane
-from pigjax.contact import BodyContact
-from pigjax.materials import Material, material_table
-from pigjax.matter import Grid, make_particles
 from pigjax.mls_mpm import SimConfig, rollout
-from pigjax.rewind import Steps, run_steps
+from pigjax.mpm import Grid, make_particles
+from pigjax.mpm.adjoint import Steps, run_steps
+from pigjax.mpm.colliders import Plane
+from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.materials import Material, material_table
 
 
 class Worst(NamedTuple):

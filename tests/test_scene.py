@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from pigjax import io
 from pigjax.cli import app
-from pigjax.errors import InputError, MissingFileError, SceneError, SimulationError
+from pigjax.core.errors import InputError, MissingFileError, SceneError, SimulationError
 from pigjax.scene import load_scene, objects, plan, run_scene, scene_from
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from dense import dense_render
 
-from pigjax.camera import Camera, look_at, stack_cameras
-from pigjax.errors import InputError
+from pigjax.core.camera import Camera, look_at, stack_cameras
+from pigjax.core.errors import InputError
 from pigjax.io import load_views
-from pigjax.overlay import id_colours, id_image, legend_sheet, overlay
+from pigjax.objects.overlay import id_colours, id_image, legend_sheet, overlay
 from pigjax.segmentation import Labels, fill_unseen, lift_masks, object_mask
 from pigjax.splat import Gaussians, RenderConfig, render
 

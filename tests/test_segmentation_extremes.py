@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from test_segmentation import ONES, facing_camera, lift, opaque
 
-from pigjax.association import compact_ids
-from pigjax.camera import Camera, look_at, stack_cameras
-from pigjax.errors import InputError
+from pigjax.core.camera import Camera, look_at, stack_cameras
+from pigjax.core.errors import InputError
+from pigjax.objects.association import compact_ids
 from pigjax.segmentation import Labels, fill_unseen, lift_masks
 from pigjax.splat import RenderConfig
 

@@ -9,14 +9,14 @@ from rounding import assert_same
 from test_scene import ball, values
 
 from pigjax import io
-from pigjax.boxes import Fit
-from pigjax.colliders import Plane, Sphere
-from pigjax.errors import InputError, SceneError
-from pigjax.materials import Material, material_table
-from pigjax.matter import Grid, make_particles, vast_grid
+from pigjax.core.errors import InputError, SceneError
 from pigjax.mls_mpm import SimConfig, rollout
+from pigjax.mpm import Grid, make_particles, vast_grid
+from pigjax.mpm.active_grid import Fit
+from pigjax.mpm.colliders import Plane, Sphere
+from pigjax.mpm.materials import Material, material_table
+from pigjax.mpm.sleep import Sleep, Sleeper
 from pigjax.scene import run_scene, scene_from
-from pigjax.sleep import Sleep, Sleeper
 
 DX = 1 / 16
 TABLE = material_table([Material("neo_hookean", density=500.0, young=2e4, poisson=0.3)])

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pigjax.errors import InputError
-from pigjax.solids import collider_from_gaussians, signed_distance
+from pigjax.core.errors import InputError
+from pigjax.coupling.sdf_collider import collider_from_gaussians, signed_distance
 from pigjax.splat import Gaussians
 
 

@@ -11,10 +11,8 @@ import pytest
 from dense import dense_render
 
 import pigjax.splat as splat_module
-from pigjax.camera import Camera, look_at
-from pigjax.errors import InputError
-from pigjax.footprints import blend_chunk, running_sums, transmittances
-from pigjax.lists import Boxes, count_pairs, front_to_back, list_pass, pairs_in_open_tiles
+from pigjax.core.camera import Camera, look_at
+from pigjax.core.errors import InputError
 from pigjax.splat import (
     OUTPUTS,
     Gaussians,
@@ -25,6 +23,8 @@ from pigjax.splat import (
     required_capacity,
     surface_depth,
 )
+from pigjax.splatting.alpha import blend_chunk, running_sums, transmittances
+from pigjax.splatting.binning import Boxes, count_pairs, front_to_back, list_pass, pairs_in_open_tiles
 
 EXACT = RenderConfig(alpha_min=1e-7, transmittance_min=0.0)
 DEFAULT = RenderConfig()
@@ -479,7 +479,7 @@ def test_two_key_sort_makes_the_same_lists(monkeypatch):
     scene, camera = make_scene(count=50)
     _, blending, boxes, shapes = lists_of(gaussians_of(scene), camera)
     one_key = list_pass(shapes, boxes, 0, None, blending, 300)
-    monkeypatch.setattr("pigjax.lists._KEY_LIMIT", 10)
+    monkeypatch.setattr("pigjax.splatting.binning._KEY_LIMIT", 10)
     two_keys = list_pass(shapes, boxes, 0, None, blending, 300)
     used = int(one_key.start[-1])
     np.testing.assert_array_equal(two_keys.start, one_key.start)

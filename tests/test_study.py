@@ -16,15 +16,15 @@ from test_scene import ball
 from typer.testing import CliRunner
 
 from pigjax import io
-from pigjax.camera import look_at, stack_cameras
 from pigjax.cli import app
-from pigjax.errors import InputError, MissingFileError, SceneError
+from pigjax.core.camera import look_at, stack_cameras
+from pigjax.core.errors import InputError, MissingFileError, SceneError
 from pigjax.scene import load_scene, run_scene, scene_from
 from pigjax.segmentation import lift_masks
 from pigjax.splat import RenderConfig, render
 from pigjax.study import Voting, experiment, load_study, sweep_study, tune_study
 from pigjax.study.objectives import pyramid_error, video
-from pigjax.tune import load_table
+from pigjax.study.optimize import load_table
 
 STUDIES = Path(__file__).parents[1] / "examples" / "studies"
 SCENE = {

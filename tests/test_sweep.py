@@ -16,10 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.sharding import Mesh
 
-from pigjax.errors import InputError, SimulationError
-from pigjax.tune import load_table, sweep
-from pigjax.tune import sweep as sweep_function
-from pigjax.tune.table import Table
+from pigjax.core.errors import InputError, SimulationError
+from pigjax.study.optimize import load_table, sweep
+from pigjax.study.optimize import sweep as sweep_function
+from pigjax.study.optimize.table import Table
 
 WORKER = Path(__file__).parent / "sweep_worker.py"
 GRID = {"a": np.linspace(-1.0, 2.0, 5), "b": [0.5, 1.0, 4.0]}
@@ -81,7 +81,7 @@ def test_shared_arrays_are_arguments_of_the_program():
 
 
 def test_a_batch_that_does_not_fit_is_halved(monkeypatch):
-    module = sys.modules["pigjax.tune.sweep"]
+    module = sys.modules["pigjax.study.optimize.sweep"]
     tried = []
 
     def run(self, index, own=module._Program.__call__):
@@ -97,7 +97,7 @@ def test_a_batch_that_does_not_fit_is_halved(monkeypatch):
 
 
 def test_memory_sizes_the_batch(monkeypatch):
-    module = sys.modules["pigjax.tune.sweep"]
+    module = sys.modules["pigjax.study.optimize.sweep"]
     # a matrix of 256 kB for each row, and room for 6 of them on each of two devices
     monkeypatch.setattr(module, "_memory", lambda device: 6 * 2 * 256e3 / module._SHARE_OF_MEMORY)
     sizes = []

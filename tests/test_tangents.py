@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pigjax.materials import Material, material_table
-from pigjax.matter import Grid, group_by_law, make_particles, to_chunks
-from pigjax.substep import Scene, Setting
-from pigjax.tangents import forces, masses, stiffness, tangents
-from pigjax.transfers import KERNELS
+from pigjax.mpm import Grid, group_by_law, make_particles, to_chunks
+from pigjax.mpm.implicit.stiffness import forces, masses, stiffness, tangents
+from pigjax.mpm.materials import Material, material_table
+from pigjax.mpm.substep import Scene, Setting
+from pigjax.mpm.transfers import KERNELS
 
 GRID = Grid(jnp.zeros(3), jnp.asarray(0.1), (8, 8, 8))
 LAWS = {

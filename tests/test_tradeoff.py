@@ -13,9 +13,9 @@ from tradeoff.errors import displacement_error, distance_travelled, enlarged, sh
 from tradeoff.points import Point, in_turn, pareto, table
 from typer.testing import CliRunner
 
-from pigjax.camera import project
 from pigjax.cli import app
-from pigjax.errors import SceneError
+from pigjax.core.camera import project
+from pigjax.core.errors import SceneError
 from pigjax.scene import load_scene, scene_from
 from pigjax.scene.accuracy import LEVELS
 from pigjax.scene.plan import make_cameras, provenance, read_inputs, render_config

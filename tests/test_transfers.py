@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pigjax.errors import InputError
-from pigjax.transfers import (
+from pigjax.core.errors import InputError
+from pigjax.mpm.transfers import (
     KERNELS,
     Stencil,
     add_windows,

@@ -13,10 +13,10 @@ from verification.flows import FRONT_T, FRONT_Z, column, friction_angle, front, 
 from verification.kernels import energy_kept, ringing, turning
 from verification.manufactured import cube_error, free_error, vortex_error
 
-from pigjax.contact import BodyContact
-from pigjax.materials import Material, material_table
-from pigjax.matter import Grid, make_particles
 from pigjax.mls_mpm import SimConfig, step
+from pigjax.mpm import Grid, make_particles
+from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.materials import Material, material_table
 
 
 @pytest.mark.slow

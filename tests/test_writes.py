@@ -18,14 +18,14 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from pigjax import cli, io
-from pigjax.camera import look_at, stack_cameras
-from pigjax.errors import InputError
-from pigjax.overlay import comparison_sheet, legend_sheet
+from pigjax.core.camera import look_at, stack_cameras
+from pigjax.core.errors import InputError
+from pigjax.objects.overlay import comparison_sheet, legend_sheet
 from pigjax.scene import load_scene, objects, run_scene
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians
-from pigjax.tune.history import History
-from pigjax.tune.table import Table, load_table
+from pigjax.study.optimize.history import History
+from pigjax.study.optimize.table import Table, load_table
 
 TABLETOP = Path(__file__).parents[1] / "examples" / "tabletop"
 STUDY = TABLETOP.parent / "studies" / "young_sweep.toml"

@@ -6,14 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pigjax.boxes import Fit
-from pigjax.camera import orbit, unproject
 from pigjax.clamp import ClampParams, eigen_clamp
-from pigjax.colliders import Plane, Sphere
-from pigjax.materials import Material, material_table
-from pigjax.matter import fit_grid, make_particles, vast_grid
+from pigjax.core.camera import orbit, unproject
+from pigjax.coupling.particles import deform, seed_particles
 from pigjax.mls_mpm import SimConfig, rollout
-from pigjax.particles import deform, seed_particles
+from pigjax.mpm import fit_grid, make_particles, vast_grid
+from pigjax.mpm.active_grid import Fit
+from pigjax.mpm.colliders import Plane, Sphere
+from pigjax.mpm.materials import Material, material_table
 from pigjax.segmentation import lift_masks
 from pigjax.splat import Gaussians, render
 

@@ -23,10 +23,10 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.special import spence
 
-from pigjax.camera import Camera, to_camera
-from pigjax.linalg import quat_to_matrix
+from pigjax.core.camera import Camera, to_camera
+from pigjax.core.linalg import quat_to_matrix
 from pigjax.splat import Frame, Gaussians, RenderConfig, Splats, blend_config, colours, project_splats
-from pigjax.tiles import blend
+from pigjax.splatting.compositor import blend
 
 # antialiasing keeps a splat's integral where it is thinner than a pixel, which parts are long before their Gaussian is
 EXACT = RenderConfig(antialias=True, alpha_min=1e-7)

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import pigjax as pj
-from pigjax.camera import Camera, look_at
-from pigjax.colliders import Plane
-from pigjax.matter import fit_grid
+from pigjax.core.camera import Camera, look_at
+from pigjax.mpm import fit_grid
+from pigjax.mpm.colliders import Plane
 from pigjax.scene import load_scene
 from pigjax.scene.plan import read_inputs, segment
 

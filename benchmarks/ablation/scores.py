@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pigjax.linalg import svd
-from pigjax.metrics import psnr, ssim
+from pigjax.core.linalg import svd
+from pigjax.core.metrics import psnr, ssim
 from pigjax.splat import Frame, Splats
 
 ASPECT = 6.0  # longest over middle axis: flat discs are no needles

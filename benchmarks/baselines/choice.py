@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pigjax.camera import Camera
+from pigjax.core.camera import Camera
 from pigjax.io import Views
 from pigjax.splat import Gaussians
 

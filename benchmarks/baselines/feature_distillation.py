@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from pigjax.camera import Camera
+from pigjax.core.camera import Camera
 from pigjax.io import Views
 from pigjax.splat import Gaussians
 

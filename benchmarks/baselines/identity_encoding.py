@@ -15,7 +15,7 @@ import numpy as np
 import optax
 from scipy.spatial import cKDTree
 
-from pigjax.camera import Camera
+from pigjax.core.camera import Camera
 from pigjax.io import Views
 from pigjax.splat import Gaussians
 

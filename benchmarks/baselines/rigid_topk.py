@@ -11,7 +11,7 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 
-from pigjax.linalg import polar
+from pigjax.core.linalg import polar
 
 
 def driving_points(points: np.ndarray, volumes: np.ndarray, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

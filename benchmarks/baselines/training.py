@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import optax
 
-from pigjax.camera import Camera
+from pigjax.core.camera import Camera
 from pigjax.io import Views
 from pigjax.splat import Gaussians, RenderConfig, render
 

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from segmentation.tabletop import TABLE, Tabletop, load_tabletop
 
-from pigjax.camera import Camera, look_at
-from pigjax.colliders import Plane
-from pigjax.filling import fill_interior
-from pigjax.materials import Material
+from pigjax.core.camera import Camera, look_at
+from pigjax.coupling.filling import fill_interior
+from pigjax.mpm.colliders import Plane
+from pigjax.mpm.materials import Material
 from pigjax.splat import Gaussians
 
 YOUNG, POISSON, DENSITY, FRICTION = 1e7, 0.2, 1000.0, 0.6

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from pigjax.association import associate_masks
+from pigjax.objects.association import associate_masks
 from pigjax.segmentation import fill_unseen, lift_masks
 from segmentation.tabletop import Tabletop, mean_scores, scores_by_object
 

@@ -14,8 +14,8 @@ from baselines.feature_distillation import image_similarities, select_by_similar
 from baselines.identity_encoding import encoded_ids, image_ids, train_encoding
 from baselines.training import Fitted
 
+from pigjax.core.metrics import score_masks
 from pigjax.io import Views
-from pigjax.metrics import score_masks
 from pigjax.segmentation import fill_unseen, lift_masks
 from pigjax.splat import Gaussians, render
 

@@ -9,7 +9,7 @@ import time
 import jax
 import numpy as np
 
-from pigjax.camera import orbit
+from pigjax.core.camera import orbit
 from pigjax.segmentation import lift_masks
 from pigjax.splat import Gaussians
 

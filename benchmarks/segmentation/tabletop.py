@@ -7,8 +7,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from pigjax.core.metrics import score_masks
 from pigjax.io import Views, load_ply, load_views, read_json
-from pigjax.metrics import score_masks
 from pigjax.segmentation import Labels, enough_capacity, object_mask
 from pigjax.splat import Gaussians, RenderConfig
 

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from pigjax import Gaussians, save_ply
-from pigjax.camera import Camera
-from pigjax.matter import vast_grid
+from pigjax.core.camera import Camera
+from pigjax.coupling.particles import deform
 from pigjax.mls_mpm import rollout
-from pigjax.particles import deform
+from pigjax.mpm import vast_grid
 from pigjax.scene import scene_from
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, render_config, segment
 from pigjax.scene.schema import Scene

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import curve_fit
 
-from pigjax.colliders import Plane
-from pigjax.contact import BodyContact
-from pigjax.matter import Grid
 from pigjax.mls_mpm import SimConfig, rollout, stable_dt
+from pigjax.mpm import Grid
+from pigjax.mpm.colliders import Plane
+from pigjax.mpm.contact import BodyContact
 from verification.common import (
     NO_GRAVITY,
     Case,

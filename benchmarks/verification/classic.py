@@ -16,11 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pigjax import substep, transfers
-from pigjax.matter import fit_grid
-from pigjax.matter.groups import by_component
 from pigjax.mls_mpm import SimConfig, rollout
-from pigjax.transfers import stage
+from pigjax.mpm import fit_grid, substep, transfers
+from pigjax.mpm.by_law import by_component
+from pigjax.mpm.transfers import stage
 from verification.bars import period
 from verification.common import NO_GRAVITY, Case, Row, elastic, in_float64, particles, percent
 from verification.kernels import KERNELS, energy_kept, ringing, turning

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pigjax.colliders import Plane
-from pigjax.materials import Material, material_table
-from pigjax.matter import Grid, make_particles
+from pigjax.mpm import Grid, make_particles
+from pigjax.mpm.colliders import Plane
+from pigjax.mpm.materials import Material, material_table
 
 NO_GRAVITY = (0.0, 0.0, 0.0)
 

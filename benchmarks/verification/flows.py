@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from pigjax.colliders import Plane
-from pigjax.materials import Material, material_table
 from pigjax.mls_mpm import SimConfig, rollout
+from pigjax.mpm.colliders import Plane
+from pigjax.mpm.materials import Material, material_table
 from verification.common import Case, Row, elastic, held, lattice, nodes, particles, percent
 
 GRAVITY = 9.81

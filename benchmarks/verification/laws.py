@@ -7,9 +7,9 @@ import math
 import jax.numpy as jnp
 import numpy as np
 
-from pigjax.materials import Material, material_table
-from pigjax.materials.fluid import tait_pressure
 from pigjax.mls_mpm import SimConfig, rollout
+from pigjax.mpm.materials import Material, material_table
+from pigjax.mpm.materials.fluid import tait_pressure
 from verification.bars import bar
 from verification.common import (
     NO_GRAVITY,

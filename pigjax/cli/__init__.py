@@ -14,7 +14,7 @@ from typing import Any
 
 from pigjax.cli import objects, scenes, studies  # their commands join the app
 from pigjax.cli.base import app, console, one_device_per_core, said
-from pigjax.errors import InputError, SimulationError
+from pigjax.core.errors import InputError, SimulationError
 
 __all__ = ["app", "main", "objects", "one_device_per_core", "scenes", "studies"]
 

@@ -69,8 +69,8 @@ def reconstruct(
     import jax
 
     from pigjax import io
-    from pigjax.reconstruct import FitConfig, provenance, reconstruct
-    from pigjax.reconstruct import Progress as Step
+    from pigjax.reconstruction.reconstruct import FitConfig, provenance, reconstruct
+    from pigjax.reconstruction.reconstruct import Progress as Step
     from pigjax.splat import RenderConfig
 
     needs_masks = only is not None or random_background
@@ -165,7 +165,7 @@ def segment(
     With --remove also the scene without an object, and the hole that it leaves in every view.
     """
     from pigjax import io
-    from pigjax.scene.objects import segment_files
+    from pigjax.cli.segmenting import segment_files
 
     cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid, origin=origin)
     loaded = io.load_views(views, masks=masks if masks is not None else True, origin=origin)
@@ -204,7 +204,7 @@ def evaluate(
 ) -> None:
     """Score objects against true masks (mIoU, mBIoU); writes OUT/scores.json and OUT/sheet.png."""
     from pigjax import io
-    from pigjax.scene.evaluate import evaluate_files
+    from pigjax.cli.evaluating import evaluate_files
 
     cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid)
     read = io.load_dataset(dataset, layout, masks=masks, vote=labels is None, max_size=max_size, holes=holes)

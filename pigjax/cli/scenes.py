@@ -24,7 +24,7 @@ from pigjax.cli.base import (
     row,
     said,
 )
-from pigjax.errors import InputError
+from pigjax.core.errors import InputError
 
 AccuracyOption = Annotated[
     str | None, typer.Option("--accuracy", help="draft, standard or reference, instead of the scene file's.")
@@ -113,7 +113,7 @@ def view(
     """Draw a file from all around."""
     one_device_per_core()
     from pigjax import io
-    from pigjax.scene.turntable import turntable
+    from pigjax.cli.turntable import turntable
 
     cloud = io.load_gaussians(path, drop_invalid=drop_invalid, origin=origin or io.origin_of(path))
     io.output_folder(out.parent, files=(out.name,))
@@ -129,7 +129,7 @@ def view(
 @app.command()
 def info(path: Annotated[Path, typer.Argument(help="A .ply, .splat or .spz, a scene file, or posed photos.")]) -> None:
     """Say what a file holds."""
-    from pigjax.scene.objects import describe_file
+    from pigjax.cli.segmenting import describe_file
 
     table = Table(show_header=False)
     for name, value in describe_file(path).items():

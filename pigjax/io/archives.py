@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Shaped
 
-from pigjax.errors import InputError
+from pigjax.core.errors import InputError
 from pigjax.io.files import PathLike, decoding, existing, writing
 
 if TYPE_CHECKING:

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from PIL import Image
 
-from pigjax.arguments import checked
-from pigjax.camera import Camera
-from pigjax.errors import InputError, MissingFileError
+from pigjax.core.arguments import checked
+from pigjax.core.camera import Camera
+from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io.capture import Capture, Shot, check_positions, name_views, one_split_each
 from pigjax.io.colmap import find_model, read_model
 from pigjax.io.files import PathLike, existing, existing_folder, read_json

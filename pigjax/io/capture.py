@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from pigjax.errors import InputError
+from pigjax.core.errors import InputError
 
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 _PHOTO_SUFFIXES = frozenset(

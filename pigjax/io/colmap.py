@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pigjax.errors import InputError
+from pigjax.core.errors import InputError
 from pigjax.io.capture import Capture, Shot, check_intrinsics, check_pinhole, find_images, rigid
 from pigjax.io.files import decoding, existing
 

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 
-from pigjax.arguments import checked
-from pigjax.camera import Camera
-from pigjax.errors import InputError
+from pigjax.core.arguments import checked
+from pigjax.core.camera import Camera
+from pigjax.core.errors import InputError
 from pigjax.io.cameras import Views, load_cameras, load_views
 from pigjax.io.capture import without_suffix
 from pigjax.io.files import PathLike, decoding, existing, existing_folder, read_json

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 import tomli_w
 
-from pigjax.errors import InputError, MissingFileError
+from pigjax.core.errors import InputError, MissingFileError
 
 PathLike = str | os.PathLike[str]
 

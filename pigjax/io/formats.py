@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pigjax.arguments import checked
-from pigjax.errors import InputError
+from pigjax.core.arguments import checked
+from pigjax.core.errors import InputError
 from pigjax.io.files import PathLike, decoding, existing
 from pigjax.io.origin import Origin, fits_float32, proper_origin
 from pigjax.io.packed import read_spz

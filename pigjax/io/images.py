@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 from PIL import Image, ImageOps
 
-from pigjax.arguments import checked
-from pigjax.errors import InputError
+from pigjax.core.arguments import checked
+from pigjax.core.errors import InputError
 from pigjax.io.files import PathLike, decoding, existing, writing
 
 _ORIENTATION = 0x0112  # EXIF tag: 1 as stored, 2 to 4 mirrored or upside down, 5 to 8 width and height exchanged

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from pigjax.errors import InputError
+from pigjax.core.errors import InputError
 from pigjax.io.capture import (
     Capture,
     Shot,

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Integer, Num
 
-from pigjax.errors import InputError, MissingFileError
+from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io.archives import ArrayHeader, load_arrays, save_arrays
 from pigjax.io.files import PathLike
 from pigjax.io.provenance import digest

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from pigjax.errors import InputError
+from pigjax.core.errors import InputError
 from pigjax.io.capture import normal_path, without_suffix
 from pigjax.io.files import decoding, read_json
 

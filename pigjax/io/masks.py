@@ -12,8 +12,8 @@ from jaxtyping import Array, Int, Integer
 from PIL import Image
 from scipy import ndimage
 
-from pigjax.arguments import checked
-from pigjax.errors import InputError, MissingFileError
+from pigjax.core.arguments import checked
+from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io.files import PathLike, decoding, existing, existing_folder, read_json, writing
 from pigjax.io.images import open_image
 from pigjax.io.mask_json import ID_LIMIT, Segments, frame_order, paint, read_view, read_views

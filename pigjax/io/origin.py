@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from pigjax.errors import InputError
+from pigjax.core.errors import InputError
 from pigjax.io.files import PathLike
 
 Origin = Sequence[float | int] | Float[np.ndarray, "3"]

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pigjax.errors import InputError
+from pigjax.core.errors import InputError
 from pigjax.io.files import PathLike, decoding, existing
 from pigjax.io.ply_table import Header
 

@@ -11,8 +11,8 @@ import numpy as np
 import plyfile
 from jaxtyping import Float
 
-from pigjax.arguments import checked
-from pigjax.errors import InputError
+from pigjax.core.arguments import checked
+from pigjax.core.errors import InputError
 from pigjax.io.colmap import read_points3d
 from pigjax.io.files import PathLike, existing, writing
 from pigjax.io.origin import Origin, shifted, unshifted

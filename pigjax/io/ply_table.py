@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pigjax.errors import InputError
+from pigjax.core.errors import InputError
 from pigjax.io.files import PathLike, decoding, existing
 
 _NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")

@@ -24,7 +24,7 @@ import jax
 import msgspec
 import numpy as np
 
-from pigjax.errors import InputError, StaleError
+from pigjax.core.errors import InputError, StaleError
 from pigjax.io.files import PathLike, decoding, output_folder, read_json, remove, write_json
 
 Parts = Mapping[str, str]

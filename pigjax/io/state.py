@@ -19,7 +19,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Shaped
 
-from pigjax.errors import InputError, StaleError
+from pigjax.core.errors import InputError, StaleError
 from pigjax.io.archives import load_arrays, save_arrays
 from pigjax.io.files import PathLike, decoding, existing, writing
 from pigjax.io.provenance import Parts, check_same

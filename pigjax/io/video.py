@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from pigjax.arguments import checked
-from pigjax.errors import InputError
+from pigjax.core.arguments import checked
+from pigjax.core.errors import InputError
 from pigjax.io.files import PathLike, existing, writing
 from pigjax.io.images import rgb_uint8
 

@@ -10,8 +10,8 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import fields
 
-from pigjax.checks import ANY, LARGEST_WHOLE, Limits, joined, location, shown, suggest
-from pigjax.errors import SceneError
+from pigjax.core.checks import ANY, LARGEST_WHOLE, Limits, joined, location, shown, suggest
+from pigjax.core.errors import SceneError
 
 _WHOLE = Limits(0, LARGEST_WHOLE)
 

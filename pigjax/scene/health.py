@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from pigjax.matter import Health, Particles
+from pigjax.mpm import Health, Particles
 
 Record: TypeAlias = dict[str, np.ndarray]  # numbers of one frame, by name
 MARK = "health_"  # what names of a record begin with in a state file

@@ -13,21 +13,21 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pigjax import io
-from pigjax.camera import Camera, orbit, stack_cameras
-from pigjax.checks import suggest
 from pigjax.clamp import ClampParams
-from pigjax.colliders import Collider
-from pigjax.contact import BodyContact
-from pigjax.errors import InputError, SceneError
-from pigjax.materials import Material, MaterialTable
-from pigjax.matter import Particles
+from pigjax.core.camera import Camera, orbit, stack_cameras
+from pigjax.core.checks import suggest
+from pigjax.core.errors import InputError, SceneError
+from pigjax.coupling.particles import Binding, bind, seed_particles
+from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.mls_mpm import SimConfig
-from pigjax.particles import Binding, bind, seed_particles
-from pigjax.scene.lifting import lift
+from pigjax.mpm import Particles
+from pigjax.mpm.colliders import Collider
+from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.materials import Material, MaterialTable
+from pigjax.mpm.sleep import Sleep
+from pigjax.objects.lifting import lift
 from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec
 from pigjax.segmentation import Labels
-from pigjax.sleep import Sleep
-from pigjax.solids import collider_from_gaussians
 from pigjax.splat import Gaussians, RenderConfig, extent_of
 
 

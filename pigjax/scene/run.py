@@ -14,20 +14,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from pigjax import io
-from pigjax.arguments import checked
-from pigjax.boxes import Fit, devices_for
-from pigjax.camera import Camera
-from pigjax.errors import SimulationError, StaleError
-from pigjax.matter import Particles, vast_grid
+from pigjax.core.arguments import checked
+from pigjax.core.camera import Camera
+from pigjax.core.errors import SimulationError, StaleError
+from pigjax.coupling.particles import deform
 from pigjax.mls_mpm import first_substeps, frame_substeps
-from pigjax.overlay import id_image, legend_sheet, overlay
-from pigjax.particles import deform
+from pigjax.mpm import Particles, vast_grid
+from pigjax.mpm.active_grid import Fit, devices_for
+from pigjax.mpm.sleep import Sleeper
+from pigjax.objects.overlay import id_image, legend_sheet, overlay
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
 from pigjax.scene.report import RunReport
 from pigjax.scene.schema import Scene
 from pigjax.segmentation import Labels
-from pigjax.sleep import Sleeper
 from pigjax.splat import Gaussians, render
 
 _SHEET_FRAMES = 12

@@ -11,11 +11,11 @@ from msgspec import field
 from msgspec.structs import asdict, replace
 
 from pigjax import io
-from pigjax.arguments import checked
-from pigjax.checks import LARGEST_WHOLE, Limits, joined, shown, suggest
-from pigjax.colliders import Box, Capsule, Collider, Cylinder, Plane, Sphere
-from pigjax.errors import InputError, MissingFileError, SceneError
-from pigjax.materials import LAWS, PRESETS, Material, Parameters
+from pigjax.core.arguments import checked
+from pigjax.core.checks import LARGEST_WHOLE, Limits, joined, shown, suggest
+from pigjax.core.errors import InputError, MissingFileError, SceneError
+from pigjax.mpm.colliders import Box, Capsule, Collider, Cylinder, Plane, Sphere
+from pigjax.mpm.materials import LAWS, PRESETS, Material, Parameters
 from pigjax.scene.accuracy import LEVELS, Accuracy, with_level
 from pigjax.scene.decode import Section, decode
 

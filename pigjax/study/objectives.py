@@ -20,11 +20,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pigjax import io
-from pigjax.arrays import matmul
-from pigjax.checks import joined, shown, suggest
-from pigjax.errors import InputError, MissingFileError, SceneError
-from pigjax.linalg import svd
-from pigjax.metrics import psnr
+from pigjax.core.arrays import matmul
+from pigjax.core.checks import joined, shown, suggest
+from pigjax.core.errors import InputError, MissingFileError, SceneError
+from pigjax.core.linalg import svd
+from pigjax.core.metrics import psnr
 from pigjax.study.experiment import Outcome
 from pigjax.study.schema import ObjectiveSpec
 

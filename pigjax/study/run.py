@@ -15,13 +15,13 @@ import numpy as np
 from msgspec.structs import asdict, replace
 
 from pigjax import io
-from pigjax.arguments import checked
-from pigjax.errors import SceneError
+from pigjax.core.arguments import checked
+from pigjax.core.errors import SceneError
 from pigjax.study.experiment import Experiment, Outcome, experiment
 from pigjax.study.objectives import Objective, Scores, check_aim, objective_of
+from pigjax.study.optimize import Bounds, History, Table, fit, search, sweep
 from pigjax.study.schema import MOST_ROWS, Study, Value
 from pigjax.study.voting import Voting, voting
-from pigjax.tune import Bounds, History, Table, fit, search, sweep
 
 Row = Mapping[str, Any]
 _FILES = ("gaussians", "names", "masks")  # of a scene; its photos and cameras enter by what is computed from them

@@ -13,9 +13,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from msgspec import field
 
-from pigjax.arguments import checked
-from pigjax.checks import LARGEST_WHOLE, Limits, joined, suggest
-from pigjax.errors import SceneError
+from pigjax.core.arguments import checked
+from pigjax.core.checks import LARGEST_WHOLE, Limits, joined, suggest
+from pigjax.core.errors import SceneError
 from pigjax.scene.decode import Section, decode
 from pigjax.scene.schema import Scene, read_file, scene_from
 

@@ -13,9 +13,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from pigjax.camera import Camera
-from pigjax.checks import suggest
-from pigjax.errors import SceneError
+from pigjax.core.camera import Camera
+from pigjax.core.checks import suggest
+from pigjax.core.errors import SceneError
 from pigjax.scene.plan import check_ids_occur, read_inputs
 from pigjax.scene.schema import Scene
 from pigjax.segmentation import enough_capacity, lift_masks

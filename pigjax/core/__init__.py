@@ -1,0 +1,1 @@
+"""Arrays, errors, checks, 3x3 linear algebra, cameras and metrics: what every other package stands on."""

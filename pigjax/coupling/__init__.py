@@ -1,0 +1,1 @@
+"""Where splats and matter meet: seeding and filling, solids and their colliders, binding and posing."""

@@ -1,0 +1,30 @@
+"""What a simulation is made of: particles and grid as users hold them, their health, and particles by law in slots."""
+
+from pigjax.mpm.by_law import Group, Grouping, bound_visual, group_by_law
+from pigjax.mpm.config import SimConfig
+from pigjax.mpm.health import Health, StepHealth, perfect_health
+from pigjax.mpm.layout import State, inverse, tile_order, to_chunks, to_rows
+from pigjax.mpm.particles import WALL, Grid, Particles, Trajectory, fit_grid, make_particles, vast_grid
+
+__all__ = [
+    "WALL",
+    "Grid",
+    "Group",
+    "Grouping",
+    "Health",
+    "Particles",
+    "SimConfig",
+    "State",
+    "StepHealth",
+    "Trajectory",
+    "bound_visual",
+    "fit_grid",
+    "group_by_law",
+    "inverse",
+    "make_particles",
+    "perfect_health",
+    "tile_order",
+    "to_chunks",
+    "to_rows",
+    "vast_grid",
+]

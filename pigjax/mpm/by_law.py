@@ -1,0 +1,222 @@
+"""Particles grouped by law: the form in which a simulation holds them.
+
+A law is traced for its own particles only, so that none pays for what it does not use. The user's order is restored
+outside.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from pigjax.core import linalg
+from pigjax.core.errors import InputError
+from pigjax.mpm.layout import State, inverse, order_of
+from pigjax.mpm.materials import LAWS, MaterialTable, Parameters, respond
+from pigjax.mpm.particles import Grid, Particles, Trajectory
+
+
+class Group(NamedTuple):
+    """What does not change of the particles of one law."""
+
+    law: str  # static
+    parameters: Parameters  # one row, or one for each material of the law
+
+
+class Grouping(NamedTuple):
+    """Particles taken apart by law, and the way back."""
+
+    groups: tuple[Group, ...]  # of the laws that move
+    states: tuple[State, ...]
+    still: Particles | None  # matter that does not move
+    parts: list[Particles]  # of all laws
+    moves: list[bool]
+    order: Array | None  # of the particles in the parts, None if it is the user's
+    apart: bool  # whether each body has a grid of its own, all behind each other along x
+
+    def particles(self, states: tuple[State, ...], grid: Grid) -> Particles:
+        """Particles in the user's order in the states that the groups have reached."""
+        remaining = iter(states)
+        moved = [
+            _ungroup(part, next(remaining), grid, self.apart) if moves else part
+            for part, moves in zip(self.parts, self.moves)
+        ]
+        return jax.tree.map(lambda *pieces: self._merge(pieces), *moved)
+
+    def path(self, paths: tuple[State, ...], grid: Grid, frames: int) -> Trajectory:
+        """Trajectory of all particles from states with an axis of frames before that of particles."""
+        remaining = iter(paths)
+        pieces = []
+        for part, moves in zip(self.parts, self.moves):
+            if moves:
+                count = len(part)
+                state = jax.tree.map(lambda rows, count=count: rows[:, :count], next(remaining))
+                visual = state.F if state.visual is None else state.visual
+                pieces.append(
+                    (_positions(part, state, grid, self.apart), state.v, visual.reshape(*visual.shape[:2], 3, 3))
+                )
+            else:
+                pieces.append((part.x[None], part.v[None], part.F_visual[None]))
+        full = [[jnp.broadcast_to(a, (frames, *a.shape[1:])) for a in piece] for piece in pieces]
+        return Trajectory(*(self._merge(arrays, axis=1) for arrays in zip(*full)))
+
+    def _merge(self, pieces, axis=0):
+        merged = jnp.concatenate(pieces, axis)
+        return merged if self.order is None else jnp.take(merged, inverse(self.order), axis)
+
+
+def group_by_law(
+    particles: Particles, table: MaterialTable, grid: Grid, pieces: int, *, apart: bool = False
+) -> Grouping:
+    """Particles by law.
+
+    The sizes are static, from `particles.counts`, made whole multiples of `pieces` by particles without mass.
+
+    Raises:
+        InputError: `particles.counts` does not add up to the particles.
+    """
+    if sum(particles.counts) != len(particles):
+        raise InputError(
+            f"Particles.counts = {particles.counts} adds up to {sum(particles.counts)}, but there are {len(particles)}"
+            " particles: make a part of them by make_particles, which counts anew."
+        )
+    rows_of = {law: [row for row, other in enumerate(table.laws) if other == law] for law in table.laws}
+    sizes = {law: sum(particles.counts[row] for row in rows) for law, rows in rows_of.items()}
+    laws = [law for law, size in sizes.items() if size]
+    order = None
+    if len(laws) > 1:
+        rank = jnp.asarray([laws.index(law) if law in laws else len(laws) for law in table.laws])
+        order = order_of(rank[particles.material], len(laws) + 1)
+
+    parts = _split(particles if order is None else _reorder(particles, order), [sizes[law] for law in laws])
+    moves = [LAWS[law].respond is not None for law in laws]
+    pairs = [
+        _group(law, part, rows_of[law], table, grid, pieces, apart)
+        for law, part, moving in zip(laws, parts, moves)
+        if moving
+    ]
+    still = next((part for part, moving in zip(parts, moves) if not moving), None)
+    groups, states = tuple(group for group, _ in pairs), tuple(state for _, state in pairs)
+    return Grouping(groups, states, still, parts, moves, order, apart)
+
+
+def by_component(rows: Array) -> Array:
+    """Tensors [3 3 c] of nine rows [9 c]."""
+    return rows.reshape(3, 3, -1)
+
+
+def by_row(tensors: Array) -> Array:
+    """Nine rows [9 c] of tensors [3 3 c]."""
+    return tensors.reshape(9, -1)
+
+
+def bound_visual(state: State, stretch: tuple[float, float]) -> State:
+    """Hold the stretches of F_visual in bounds: flow without end would otherwise draw needles."""
+    if state.visual is None:
+        return state
+    u, s, v = linalg.svd(state.visual.reshape(-1, 3, 3))
+    s = jnp.clip(s, *stretch)
+    return state._replace(visual=linalg.matmul3(u * s[..., None, :], linalg.transpose(v)).reshape(-1, 9))
+
+
+def _group(law, part, rows, table, grid, pieces, apart):
+    """Particles of one law with their present stress, at rest and without mass where they are not finite.
+
+    Those outside begin half a cell beyond where the wall holds them: near enough for the weights of the kernel, and
+    far enough to be counted.
+    """
+    kind, several = LAWS[law], len(rows) > 1
+    parameters = table.rows(np.array(rows) if several else rows[0])
+    own_row = jnp.searchsorted(jnp.asarray(rows), part.material)
+    last = np.array(grid.shape, part.x.dtype) - 1
+    cells = jnp.clip((part.x - grid.origin) / grid.dx, 0.5, last - 0.5)
+    eye = np.eye(3).reshape(-1)
+    given = State(
+        cells=cells,
+        rounded=jnp.zeros_like(part.x),
+        v=part.v,
+        C=part.C,
+        F=part.F,
+        stress=None,
+        mass=part.mass,
+        volume=part.volume0,
+        hardening=part.hardening,
+        visual=None if kind.total else part.F_visual,
+        row=None,
+    )
+    given = jax.tree.map(lambda leaf: leaf.reshape(len(part), -1), given)
+    rest = jax.tree.map(lambda _: 0.0, given)._replace(cells=(last + 1) / 2, F=eye, visual=None if kind.total else eye)
+
+    def sound(state, ok):
+        return jax.tree.map(lambda leaf, safe: jnp.where(ok[:, None], leaf, jnp.asarray(safe, leaf.dtype)), state, rest)
+
+    # x itself too, since its clipped cells are finite where it is infinite
+    ok = _finite((given, part.x)) & (part.mass >= 0) & (part.volume0 > 0)
+    state = sound(given, ok)
+    F, rate = by_component(state.F.T), by_component(state.C.T)
+    of_each = jax.tree.map(lambda p: p[own_row], parameters) if several else parameters
+    inner = state.hardening[:, 0] if kind.hardens else None
+    F, inner, stress = respond(law, F, rate, 0.0, inner, of_each)
+    inner = state.hardening if inner is None else inner[:, None]
+    state = state._replace(F=by_row(F).T, hardening=inner)
+    stress = by_row(stress).T
+    ok &= _finite((state, stress))
+    state = sound(state, ok)
+    state = state._replace(
+        cells=state.cells + (_own_grid(part, grid) if apart else 0),
+        stress=jnp.where(ok[:, None], stress, 0.0),
+        hardening=state.hardening if kind.hardens else None,
+        row=own_row.astype(part.x.dtype)[:, None] if several else None,
+    )
+    padding = -len(part) % pieces
+    if padding:
+        state = jax.tree.map(lambda rows: jnp.pad(rows, ((0, padding), (0, 0)), mode="edge"), state)
+        state = state._replace(**{name: getattr(state, name).at[-padding:].set(0) for name in ("mass", "volume")})
+    return Group(law, parameters), state
+
+
+def _finite(trees):
+    """Which particles are finite in every row."""
+    return jnp.isfinite(sum(rows.sum(-1) for rows in jax.tree.leaves(trees)))
+
+
+def _ungroup(part, state, grid, apart):
+    """Particles with the state that their group has reached; x is NaN of those that are no longer finite."""
+    state = jax.tree.map(lambda rows: rows[: len(part)], state)
+    F = state.F.reshape(-1, 3, 3)
+    return eqx.tree_at(
+        lambda p: (p.x, p.v, p.C, p.F, p.hardening, p.F_visual),
+        part,
+        (
+            _positions(part, state, grid, apart),
+            state.v,
+            state.C.reshape(-1, 3, 3),
+            F,
+            part.hardening if state.hardening is None else state.hardening[:, 0],
+            F if state.visual is None else state.visual.reshape(-1, 3, 3),
+        ),
+    )
+
+
+def _positions(part, state, grid, apart):
+    cells = state.cells - (_own_grid(part, grid) if apart else 0)
+    return jnp.where(state.volume > 0, grid.origin + grid.dx * cells, jnp.nan)
+
+
+def _own_grid(part, grid):
+    """Where the grid of a particle's body begins [cells]."""
+    return (part.body[:, None] * grid.shape[0] * np.eye(1, 3, dtype=int)).astype(part.x.dtype)
+
+
+def _split(particles, sizes):
+    ends = np.cumsum(sizes)
+    return [jax.tree.map(lambda a, low=end - size, high=end: a[low:high], particles) for size, end in zip(sizes, ends)]
+
+
+def _reorder(particles, order):
+    return jax.tree.map(lambda array: array[order], particles)

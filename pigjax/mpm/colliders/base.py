@@ -1,0 +1,227 @@
+"""What all colliders share: pose and motion, contact by mode, and checks of their numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from pigjax.core.arrays import as_array, as_float, static_field
+from pigjax.core.checks import ANY, is_numeric, shown
+from pigjax.core.errors import InputError
+from pigjax.core.linalg import quat_multiply, quat_to_matrix, safe_norm, safe_normalize
+
+MODES = ("sticky", "slip", "separate")
+Points = Float[Array, "*n 3"]
+Scalar = Float[Array, ""]
+Time = Float[Array, ""] | float
+
+
+def number(**kwargs: Any) -> Any:
+    """Dynamic field of real numbers; integers become real."""
+    return eqx.field(converter=_as_real, **kwargs)
+
+
+def _as_real(value):
+    value = jnp.asarray(as_float(value)) if isinstance(value, int) and not isinstance(value, bool) else as_array(value)
+    return value.astype(float) if isinstance(value, Array) and jnp.issubdtype(value.dtype, jnp.integer) else value
+
+
+class Contact(NamedTuple):
+    """A collider as the grid sees it."""
+
+    inside: Bool[Array, "*n"] | Float[Array, "*n"]  # or the share of a soft contact
+    normal: Float[Array, "*n 3"]
+    velocity: Float[Array, "*#n 3"] | None = None  # of the collider's matter at the points [m/s]; None: at rest
+
+
+class Press(NamedTuple):
+    """How nodes press against a collider, where that is known beforehand."""
+
+    speed: Float[Array, "*n 1"]  # [m/s]: friction takes at most its coefficient times this from what glides
+    secant: bool = False  # whether friction has the derivative of a drag of the strength that it happens to have
+
+
+class Collider(eqx.Module):
+    """Base of all colliders.
+
+    Modes: "sticky" holds matter, "slip" lets it glide but not leave, "separate" lets it glide with Coulomb friction and
+    leave. At the start of a rollout the shape stands turned by `rotation` about `pivot`; from there it moves with
+    `velocity` and turns with `angular_velocity` about the pivot, which moves along. All may be differentiated. What is
+    None is not traced.
+
+    Whether a point is inside is a hard test, which has no derivative: a rollout can be differentiated by friction, by
+    velocities and, through the normals, by the pose, but a plane shifted along its normal changes nothing until it
+    passes a node. With a `softness`, contact sets in smoothly over that width, and so all of the pose counts.
+
+    Raises:
+        InputError: the mode is unknown, or a number is not finite or out of range; the message starts with the field.
+    """
+
+    friction: Scalar = number(default=0.0, kw_only=True)  # Coulomb's coefficient, for "separate"
+    velocity: Float[Array, "3"] | None = number(default=None, kw_only=True)  # prescribed [m/s]
+    angular_velocity: Float[Array, "3"] | None = number(default=None, kw_only=True)  # prescribed [rad/s]
+    rotation: Float[Array, "4"] | None = number(default=None, kw_only=True)  # wxyz, of any length
+    pivot: Float[Array, "3"] | None = number(default=None, kw_only=True)  # [m]; None: the middle of the shape
+    elapsed: Scalar = number(default=0.0, kw_only=True)  # since it was where its numbers say [s]
+    softness: Scalar | None = number(default=None, kw_only=True)  # width over which contact sets in [m]; None: hard
+    mode: str = static_field(default="separate", kw_only=True)
+
+    def __check_init__(self):
+        if self.mode not in MODES:
+            raise InputError(f"mode = {self.mode!r}: choose one of {', '.join(MODES)}.")
+        for field in dataclasses.fields(self):
+            self.require(field.name, "its numbers must be finite", np.isfinite)
+            self.require(field.name, "its numbers must be at most 1e15", lambda v: np.abs(v) <= ANY.high)
+        self.require("friction", "a collider's friction coefficient must be >= 0", lambda friction: friction >= 0)
+        self.require("softness", "it must be > 0 m, or None for a hard contact", lambda width: width > 0)
+        self.require("rotation", "a quaternion must not be zero", has_direction)
+
+    def require(self, name: str, rule: str, holds: Callable[[Any], Any]) -> None:
+        """Raise an InputError that names the field if its values are concrete and break the rule."""
+        self._check_types()
+        value = getattr(self, name)
+        if not isinstance(value, Array) or isinstance(value, jax.core.Tracer):
+            return
+        kept = holds(np.asarray(value))
+        if not isinstance(kept, jax.core.Tracer) and not np.all(kept):
+            shown = value.tolist() if value.size <= 4 else f"array of {value.size} numbers"
+            raise InputError(f"{name} = {shown}: {rule}.")
+
+    def _check_types(self) -> None:
+        """Whether every number is one, and every vector has its length: what the rules of subclasses stand on."""
+        for field in dataclasses.fields(self):
+            value, kind = getattr(self, field.name), str(field.type)
+            traced = isinstance(value, jax.core.Tracer)
+            if field.metadata.get("static", False) or (value is None and "None" in kind):
+                continue
+            if not traced and not is_numeric(value):
+                raise InputError(f"{field.name} = {shown(value)}: it must be a number, or an array of numbers.")
+            length = re.search(r"Array, .([0-9])", kind)
+            wanted = 3 if "nx ny nz" in kind else 0 if "Scalar" in kind else 1
+            if np.ndim(value) != wanted or (length is not None and np.shape(value) != (int(length[1]),)):
+                many = f"{length[1]} numbers" if length else f"an array of {wanted} axes" if wanted else "one number"
+                raise InputError(f"{field.name} = {shown(value)}: it must be {many}.")
+
+    @abstractmethod
+    def shape_distance(self, points: Points) -> Float[Array, "*n"]:
+        """Signed distance of points [m] from the surface where the shape's own numbers put it, negative inside [m]."""
+
+    @abstractmethod
+    def ball(self) -> tuple[Float[Array, "3"], Scalar | float]:
+        """Middle of the shape [m], and the radius around it that holds all of it [m]; may be infinite."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether its contact depends on time; static."""
+        return self.velocity is not None or self.angular_velocity is not None
+
+    def distance(self, points: Points, time: Time = 0.0) -> Float[Array, "*n"]:
+        """Signed distance of points [m] from the surface a time [s] from now, negative inside [m]."""
+        return self.shape_distance(self._to_shape(points, time))
+
+    def normals(self, points: Points, time: Time = 0.0) -> Points:
+        """Outward unit normal: the direction in which the distance grows; zero where there is none, as at a centre."""
+        return self._distance_and_normals(points, time)[1]
+
+    def contact(self, points: Points, time: Time = 0.0) -> Contact:
+        """Which points [m] are inside a time [s] from now, the normals there, and the collider's velocity."""
+        distance, normals = self._distance_and_normals(points, time)
+        inside = distance < 0
+        if self.softness is not None:
+            depth = jnp.clip(0.5 - distance / self.softness, 0.0, 1.0)
+            inside = depth * depth * (3 - 2 * depth)
+        return Contact(inside, normals, self._own_velocity(points, time))
+
+    def after(self, duration: Time) -> Collider:
+        """The collider where it will be after a duration [s], to go on from a rollout of that length."""
+        if not self.moves:
+            return self
+        return eqx.tree_at(lambda collider: collider.elapsed, self, self.elapsed + duration)
+
+    def top_speed(self, points: Float[Array, "*n 3"], duration: Time = 0.0) -> Scalar:
+        """Bound of its speed [m/s] among points [m], such as the corners of a grid, during a duration [s] from now."""
+        speed = jnp.zeros(()) if self.velocity is None else safe_norm(self.velocity)
+        if self.angular_velocity is None:
+            return speed
+        middle, radius = self.ball()
+        reach = safe_norm(middle - self._pivot) + radius
+        # the way from a pivot that moves straight is convex in time: the longest is at the start or at the end
+        longest = [safe_norm(points - self._pivot_at(time)).max() for time in (0.0, duration)]
+        return speed + safe_norm(self.angular_velocity) * jnp.minimum(reach, jnp.maximum(*longest))
+
+    def apply(self, contact: Contact, velocity: Points, press: Press | None = None) -> Points:
+        """Velocities of grid nodes [m/s] after they met it, with friction by how they did so or as `press` says."""
+        own = 0.0 if contact.velocity is None else contact.velocity
+        touched = own + self._allowed(velocity - own, contact.normal, press)
+        inside = contact.inside[..., None]
+        if self.softness is None:
+            return jnp.where(inside, touched, velocity)
+        return velocity + inside * (touched - velocity)
+
+    def _allowed(self, relative, normal, press):
+        if self.mode == "sticky":
+            return jnp.zeros_like(relative)
+        speed = (relative * normal).sum(-1, keepdims=True)
+        tangential = relative - speed * normal
+        if self.mode == "slip":
+            return tangential
+        glide = safe_norm(tangential)[..., None]
+        if press is not None:
+            bound = self.friction * press.speed
+            drag = jnp.where(glide > bound, bound / jnp.where(glide > bound, glide, 1.0), press.speed > 0)
+            drag = lax.stop_gradient(drag) if press.secant else drag
+            return (1 - drag) * tangential + jnp.maximum(speed, 0.0) * normal
+        # Coulomb: the tangential impulse is at most the friction coefficient times the normal one, which is -speed.
+        # What is too slow to glide is not divided by: the slope at next to no glide would be infinite times nothing.
+        glides = (speed < 0) & (glide >= -self.friction * speed)
+        kept = jnp.where(glides, 1 + self.friction * speed / jnp.where(glides & (glide > 0), glide, 1.0), 0.0)
+        return jnp.where(speed < 0, kept * tangential, relative)
+
+    def _distance_and_normals(self, points, time):
+        distance, pull = jax.vjp(lambda p: self.distance(p, time), points)
+        return distance, safe_normalize(pull(jnp.ones_like(distance))[0])
+
+    @property
+    def _pivot(self):
+        return self.ball()[0] if self.pivot is None else self.pivot
+
+    def _pivot_at(self, time):
+        return self._pivot if self.velocity is None else self._pivot + self.velocity * (self.elapsed + time)
+
+    def _to_shape(self, points, time):
+        """The same points of the body where the shape's own numbers describe it."""
+        turn = self.rotation
+        if self.angular_velocity is not None:
+            turned = _quat_of_spin(self.angular_velocity * (self.elapsed + time))
+            turn = turned if turn is None else quat_multiply(turned, turn)
+        if turn is not None:
+            from_pivot = points - self._pivot_at(time)
+            return self._pivot + (from_pivot[..., :, None] * quat_to_matrix(turn)).sum(-2)
+        return points if self.velocity is None else points - self.velocity * (self.elapsed + time)
+
+    def _own_velocity(self, points, time):
+        if self.angular_velocity is None:
+            return self.velocity
+        spin = jnp.cross(self.angular_velocity, points - self._pivot_at(time))
+        return spin if self.velocity is None else self.velocity + spin
+
+
+def has_direction(vector: np.ndarray) -> Any:
+    """Whether a vector has a length that single precision can divide by."""
+    return np.square(vector, dtype=np.float64).sum(-1) > 1e-37
+
+
+def _quat_of_spin(vector):
+    """Unit quaternion that turns about a vector by its length [rad]."""
+    angle = safe_norm(vector)
+    return jnp.concatenate([jnp.cos(angle / 2)[None], vector * jnp.sinc(angle / (2 * np.pi)) / 2])

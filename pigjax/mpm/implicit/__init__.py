@@ -1,0 +1,1 @@
+"""Implicit steps: Newton's method on the grid, Krylov solves, stiffness."""

@@ -1,0 +1,132 @@
+"""The laws by name, all with one face: one step of a particle's elastic state, and the stress after it.
+
+To add a law: write its stress or return map in the module of its kind, wrap it here with what the stages must know of
+it, and test its stress or return point against a closed form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from pigjax.core.errors import InputError
+from pigjax.mpm.materials import elastic, fibres, fluid, foam, plastic, plasticine, snow
+from pigjax.mpm.materials.tensors import Scalars, Tensors, determinant, identity, product, spectral, svd
+
+
+class Response(NamedTuple):
+    """State of particles after a step, and the Kirchhoff stress of that state [Pa]."""
+
+    F: Float[Array, "3 3 *n"]  # elastic deformation gradient
+    hardening: Float[Array, "*n"] | None  # as given where the law does not harden
+    stress: Float[Array, "3 3 *n"]
+
+
+class Law(NamedTuple):
+    """A constitutive law: `respond(F, rate, dt, hardening, m)`, and what the stages around it must know of it."""
+
+    respond: Callable[..., Response] | None  # None: matter that never moves
+    needs: tuple[str, ...]  # material parameters that must be given
+    total: bool  # whether F is the total deformation, so that F_visual is F
+    hardens: bool  # whether the law has an internal variable, which is 0 at first
+    modulus: Callable[..., Scalars]  # of `Parameters`: the most that pressure waves meet at small stretches [Pa]
+
+
+def respond(model: str, F: Tensors, rate: Tensors, dt, hardening: Scalars | None, m) -> Response:
+    """One step of law `model` from F with the velocity gradient `rate` [1/s] over dt [s].
+
+    `m` is a `MaterialTable` with one row for each particle, or a single row. With dt = 0 it is the stress of F itself.
+    The internal variable `hardening` may be None where the law has none (`Law.hardens`).
+
+    Raises:
+        InputError: the model is unknown or does not move.
+    """
+    law = law_of(model).respond
+    if law is None:
+        raise InputError(f"Material model {model!r} has no stress: it never moves.")
+    return law(F, rate, dt, hardening, m)
+
+
+def law_of(model: str) -> Law:
+    """The law of that name.
+
+    Raises:
+        InputError: there is none.
+    """
+    if model not in LAWS:
+        raise InputError(f"Material model {model!r} is unknown: choose one of {', '.join(sorted(LAWS))}.")
+    return LAWS[model]
+
+
+def _pressure_modulus(m) -> Scalars:
+    return m.lam + 2 * m.mu
+
+
+def _elastic(stress, *, needs=(), modulus=_pressure_modulus) -> Law:
+    def step(F, rate, dt, hardening, m):
+        F = F + dt * product(rate, F)
+        return Response(F, hardening, stress(F, m))
+
+    return Law(step, ("young", "poisson", *needs), total=True, hardens=False, modulus=modulus)
+
+
+def _plastic(flow, *, needs, hardens=True, modulus=_pressure_modulus) -> Law:
+    """A law of `flow(trial stretches, hardening, dt, m) -> (stretches, hardening, principal stresses)`."""
+
+    def step(F, rate, dt, hardening, m):
+        u, s, v = svd(F + dt * product(rate, F))
+        s, hardening, stress = flow(s, hardening, dt, m)
+        return Response(spectral(u, s, v), hardening, spectral(u, stress))
+
+    return Law(step, ("young", "poisson", *needs), total=False, hardens=hardens, modulus=modulus)
+
+
+def _hencky(return_map, stress=lambda strain, hardening, m: elastic.hencky_stress(strain, m)):
+    """Flow of stretches by a return map of Hencky strains."""
+
+    def flow(stretches, hardening, dt, m):
+        strain, hardening = return_map(elastic.hencky_strain(stretches), hardening, m)
+        return jnp.exp(strain), hardening, stress(strain, hardening, m)
+
+    return flow
+
+
+def _snow(stretches, hardening, dt, m):
+    stretches, hardening = snow.crumble(stretches, hardening, m)
+    return stretches, hardening, snow.stress(stretches, hardening, m)
+
+
+def _foam(stretches, hardening, dt, m):
+    strain = foam.herschel_bulkley(elastic.hencky_strain(stretches), dt, m)
+    return jnp.exp(strain), hardening, elastic.hencky_stress(strain, m)
+
+
+def _fluid(F, rate, dt, hardening, m):
+    J = fluid.volume_ratio(determinant(F), rate, dt)
+    return Response(jnp.cbrt(J) * identity(F), hardening, fluid.newtonian(J, rate, m))
+
+
+LAWS = {
+    "fixed_corotated": _elastic(elastic.fixed_corotated),
+    "neo_hookean": _elastic(elastic.neo_hookean),
+    "stvk_hencky": _elastic(elastic.stvk_hencky),
+    "fibres": _elastic(
+        fibres.fibre_reinforced,
+        needs=("fibre_stiffness",),
+        modulus=lambda m: _pressure_modulus(m) + m.fibre_stiffness,
+    ),
+    "von_mises": _plastic(_hencky(plastic.von_mises), needs=("yield_stress",)),
+    "plasticine": _plastic(_hencky(plasticine.return_map, plasticine.stress), needs=("yield_stress",)),
+    "drucker_prager": _plastic(_hencky(plastic.drucker_prager), needs=("friction_angle",)),
+    "snow": _plastic(
+        _snow,
+        needs=("critical_compression", "critical_stretch"),
+        modulus=lambda m: _pressure_modulus(m) * snow.largest_hardening_factor(m),
+    ),
+    "foam": _plastic(_foam, needs=("yield_stress", "viscosity", "flow_exponent"), hardens=False),
+    "fluid": Law(_fluid, ("bulk",), total=False, hardens=False, modulus=lambda m: m.bulk),
+    "stationary": Law(None, (), total=True, hardens=False, modulus=lambda m: jnp.zeros_like(m.density)),
+}

@@ -1,0 +1,191 @@
+"""Materials as a user states them, and the table of all materials of a simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from pigjax.core.arguments import checked
+from pigjax.core.arrays import as_array, as_float, static_field
+from pigjax.core.checks import Limits, is_numeric, shown
+from pigjax.core.errors import InputError
+from pigjax.mpm.materials.laws import law_of
+
+
+def _number(**kwargs):
+    """A number that a user may sweep: always an array, so that a new value never recompiles."""
+    return eqx.field(converter=_as_number, kw_only=True, **kwargs)
+
+
+def _as_number(value):
+    real = isinstance(value, int | float) and not isinstance(value, bool)
+    return jnp.asarray(as_float(value)) if real else as_array(value)
+
+
+class Parameters(eqx.Module):
+    """The numbers of materials in SI units. A law ignores those that it has no use for."""
+
+    density: Float[Array, "*m"] = _number()  # at rest [kg/m³]
+    young: Float[Array, "*m"] = _number(default=0.0)  # Young's modulus [Pa]
+    poisson: Float[Array, "*m"] = _number(default=0.0)  # Poisson's ratio
+    yield_stress: Float[Array, "*m"] = _number(default=0.0)  # uniaxial [Pa]
+    hardening_modulus: Float[Array, "*m"] = _number(default=0.0)  # rise of the yield stress by plastic strain [Pa]
+    residual_stress: Float[Array, "*m"] = _number(default=0.0)  # the yield stress softens no further [Pa]
+    friction_angle: Float[Array, "*m"] = _number(default=0.0)  # [rad]
+    cohesion: Float[Array, "*m"] = _number(default=0.0)  # [Pa]
+    bulk_modulus: Float[Array, "*m"] = _number(default=0.0)  # of a fluid; 0: from young and poisson [Pa]
+    viscosity: Float[Array, "*m"] = _number(default=0.0)  # dynamic [Pa s]; of a foam [Pa sʰ] with its exponent h
+    flow_exponent: Float[Array, "*m"] = _number(default=1.0)  # h of Herschel and Bulkley; 1 is Bingham's, < 1 thins
+    hardening_coefficient: Float[Array, "*m"] = _number(default=10.0)  # ξ of snow
+    critical_compression: Float[Array, "*m"] = _number(default=2.5e-2)  # strain at which snow is packed
+    critical_stretch: Float[Array, "*m"] = _number(default=7.5e-3)  # strain at which snow breaks
+    fibre_stiffness: Float[Array, "*m"] = _number(default=0.0)  # Young's modulus that fibres add along them [Pa]
+    fibre_azimuth: Float[Array, "*m"] = _number(default=0.0)  # of fibres at rest, about z from x [rad]
+    fibre_elevation: Float[Array, "*m"] = _number(default=0.0)  # of fibres at rest, above the plane of x and y [rad]
+
+    @property
+    def mu(self) -> Float[Array, "*m"]:
+        """Shear modulus μ = E / 2(1 + ν) [Pa]."""
+        return self.young / (2 * (1 + self.poisson))
+
+    @property
+    def lam(self) -> Float[Array, "*m"]:
+        """Lamé's first parameter λ = E ν / (1 + ν)(1 − 2ν) [Pa]."""
+        return self.young * self.poisson / ((1 + self.poisson) * (1 - 2 * self.poisson))
+
+    @property
+    def bulk(self) -> Float[Array, "*m"]:
+        """Bulk modulus [Pa]: as given, or λ + 2μ/3."""
+        return jnp.where(self.bulk_modulus > 0, self.bulk_modulus, self.lam + 2 / 3 * self.mu)
+
+
+class Material(Parameters):
+    """One material: the name of its law, and the numbers that the law needs.
+
+    Raises:
+        InputError: the law is unknown, or a number is missing, not finite or out of range.
+    """
+
+    model: str = static_field()  # one of `materials.LAWS`
+
+    def __check_init__(self):
+        if not isinstance(self.model, str):
+            raise InputError(f"model = {shown(self.model)}: it must be the name of a law.")
+        for number in fields(Parameters):
+            value = getattr(self, number.name)
+            if not isinstance(value, jax.core.Tracer) and not is_numeric(value):
+                raise InputError(f"{number.name} = {shown(value)}: {LIMITS[number.name][0]} must be a number.")
+        needed = ("density", *law_of(self.model).needs)
+        for name, (noun, limits) in LIMITS.items():
+            value = getattr(self, name)
+            if isinstance(value, jax.core.Tracer):
+                continue
+            value = np.asarray(value)
+            given = name in needed or np.any(value != 0)
+            rule = limits.broken(value) if given else None
+            if rule is not None:
+                raise InputError(f"{name} = {shown(value)}: {noun} {rule} in a material of model {self.model!r}.")
+        for name, models, limit, holds in _JOINT_LIMITS:
+            held = holds(self) if self.model in models else True
+            if not isinstance(held, jax.core.Tracer) and not np.all(held):
+                raise InputError(
+                    f"{name} = {shown(getattr(self, name))}: {limit} in a material of model {self.model!r}."
+                )
+
+
+# What each number is called, and its range where a law needs it or it is given.
+LIMITS: dict[str, tuple[str, Limits]] = {
+    "density": ("the density", Limits(0, 1e9, above=True, unit="kg/m³")),
+    "young": ("Young's modulus", Limits(0, above=True, unit="Pa")),
+    "poisson": ("Poisson's ratio", Limits(-1, 0.5, above=True, below=True)),
+    "yield_stress": ("the yield stress", Limits(0, above=True, unit="Pa")),
+    "hardening_modulus": ("the hardening modulus", Limits(unit="Pa")),
+    "residual_stress": ("the residual yield stress", Limits(0.0, unit="Pa")),
+    "friction_angle": ("the friction angle", Limits(0, np.pi / 2, above=True, below=True, unit="rad")),
+    "cohesion": ("the cohesion", Limits(0.0, unit="Pa")),
+    "bulk_modulus": ("the bulk modulus", Limits(0.0, unit="Pa")),
+    "bulk": ("the bulk modulus, given or from young and poisson,", Limits(0, above=True, unit="Pa")),
+    "viscosity": ("the viscosity", Limits(0.0, unit="Pa s")),
+    "flow_exponent": ("the flow exponent", Limits(0.1, 10.0)),
+    "hardening_coefficient": ("the hardening coefficient", Limits(0.0, 1e3)),
+    "critical_compression": ("the critical compression", Limits(0, 1, above=True, below=True)),
+    "critical_stretch": ("the critical stretch", Limits(0, 1e3, above=True)),
+    "fibre_stiffness": ("the stiffness of fibres", Limits(0, above=True, unit="Pa")),
+    "fibre_azimuth": ("the azimuth of fibres", Limits(-1e6, 1e6, unit="rad")),
+    "fibre_elevation": ("the elevation of fibres", Limits(-1e6, 1e6, unit="rad")),
+}
+# Laws, and what must hold between the numbers of one material.
+_JOINT_LIMITS = (
+    (
+        "hardening_modulus",
+        ("von_mises",),
+        "softening must stay above -3 times the shear modulus E/2(1+ν)",
+        lambda m: m.hardening_modulus > -3 * m.mu,
+    ),
+    (
+        "hardening_modulus",
+        ("plasticine",),
+        "it must be <= 0 Pa, since damage grows",
+        lambda m: m.hardening_modulus <= 0,
+    ),
+    (
+        "residual_stress",
+        ("von_mises", "plasticine"),
+        "it must not be above the yield stress",
+        lambda m: m.residual_stress <= m.yield_stress,
+    ),
+    ("viscosity", ("foam",), "it must be > 0 Pa sʰ", lambda m: m.viscosity > 0),
+)
+
+
+class MaterialTable(Parameters):
+    """All materials of a simulation, one a row. The laws are static, the numbers are swept and differentiated."""
+
+    laws: tuple[str, ...] = static_field()  # of each row
+
+    def __len__(self) -> int:
+        return len(self.laws)
+
+    def rows(self, index: int | Int[Array, "*p"] | Int[np.ndarray, "*p"]) -> Parameters:
+        """Numbers of one row, or of the row of each particle."""
+        return Parameters(**{f.name: getattr(self, f.name)[index] for f in fields(Parameters)})
+
+    @property
+    def wave_speed(self) -> Float[Array, "m"]:
+        """Speed of pressure waves [m/s] at small stretches, √(M/ρ); 0 where matter never moves.
+
+        The modulus M is λ + 2μ, along fibres with their stiffness, in snow as packed as can be; in a fluid K.
+        """
+        modulus = sum(self._of(law, law_of(law).modulus(self)) for law in dict.fromkeys(self.laws))
+        return jnp.sqrt(modulus / self.density)
+
+    @property
+    def explicit_viscosity(self) -> Float[Array, "m"]:
+        """Viscosity [Pa s] of the laws whose viscous stress limits an explicit step; 0 in the others.
+
+        Foam is not among them: its flow is implicit in each particle.
+        """
+        return self._of("fluid", self.viscosity)
+
+    def _of(self, law: str, values: Float[Array, "m"]) -> Float[Array, "m"]:
+        """Values in the rows of a law, 0 in the others."""
+        return jnp.where(np.array([other == law for other in self.laws]), values, 0.0)
+
+
+@checked
+def material_table(materials: Sequence[Material]) -> MaterialTable:
+    """Table with one row for each material, in their order.
+
+    Raises:
+        InputError: there is none.
+    """
+    if not materials:
+        raise InputError("material_table needs at least one material.")
+    columns = {f.name: jnp.stack([getattr(m, f.name) for m in materials]) for f in fields(Parameters)}
+    return MaterialTable(laws=tuple(m.model for m in materials), **columns)

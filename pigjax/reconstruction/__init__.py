@@ -1,0 +1,1 @@
+"""Photos to Gaussians: initialisation, training, MCMC relocation, pruning."""

@@ -1,0 +1,63 @@
+"""Markov-chain moves of 3D Gaussians (Kheradmand et al. 2024): dead splats move onto live ones, and all are shaken.
+
+The number of splats never changes, so shapes stay static while the scene redistributes its budget.
+"""
+
+from __future__ import annotations
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from pigjax.core.arrays import einsum
+from pigjax.core.linalg import quat_to_matrix
+from pigjax.splat import Gaussians
+
+DEAD_OPACITY = 0.005
+_MOST_COPIES = 8  # of one splat in one move; the formula's alternating sum loses float32 digits beyond
+
+
+def relocate(gaussians: Gaussians, key: PRNGKeyArray) -> tuple[Gaussians, Float[Array, "n"], Int[Array, ""]]:
+    """Move every dead splat onto a live one drawn by opacity, and thin the pile so that the picture stays the same.
+
+    Returns:
+        The Gaussians, 1 for splats whose optimiser state still holds and 0 for those that changed, and how many moved.
+    """
+    opacities = jax.nn.sigmoid(gaussians.logit_opacities)
+    dead = opacities < DEAD_OPACITY
+    # with nothing alive there is nowhere to go
+    dead &= ~jnp.all(dead)
+    # `categorical` would draw a number for every pair of splats
+    target = jax.random.choice(key, opacities.shape[0], opacities.shape, p=jnp.where(dead, 0.0, opacities))
+    source = jnp.where(dead, target, jnp.arange(opacities.shape[0]))
+    copies = jnp.minimum(jnp.zeros_like(source).at[source].add(1), _MOST_COPIES)[source]
+    opacity, shrink = split_opacity(opacities[source], copies)
+    moved = jax.tree.map(lambda values: values[source], gaussians)
+    changed = copies > 1
+    logit = jnp.where(changed, jnp.log(opacity) - jnp.log1p(-opacity), moved.logit_opacities)
+    log_scales = moved.log_scales + jnp.where(changed, jnp.log(shrink), 0.0)[:, None]
+    moved = eqx.tree_at(lambda g: (g.logit_opacities, g.log_scales), moved, (logit, log_scales))
+    return moved, jnp.where(changed, 0.0, 1.0), jnp.sum(dead)
+
+
+def split_opacity(opacity: Float[Array, "n"], copies: Int[Array, "n"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    """Opacity of each of N coincident copies, and the factor on their scales, that keep the blended splat (eq. 9)."""
+    opacity = jnp.clip(opacity, DEAD_OPACITY, 1 - 1e-6)
+    each = -jnp.expm1(jnp.log1p(-opacity) / copies)
+    total = jnp.zeros_like(opacity)
+    for i in range(1, _MOST_COPIES + 1):
+        terms = [math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * each ** (k + 1) for k in range(i)]
+        total = total + jnp.where(i <= copies, jnp.sum(jnp.stack(terms), 0), 0.0)
+    return each, opacity / total
+
+
+def shake(gaussians: Gaussians, key: PRNGKeyArray, scale: Float[Array, ""] | float) -> Gaussians:
+    """Noise on the centres, shaped by each covariance and only on faint splats, so that they explore (eq. 8)."""
+    faint = jax.nn.sigmoid(-100 * (jax.nn.sigmoid(gaussians.logit_opacities) - DEAD_OPACITY))
+    noise = jax.random.normal(key, gaussians.means.shape, gaussians.means.dtype) * (faint * scale)[:, None]
+    rotation = quat_to_matrix(gaussians.quats)
+    local = einsum("nji,nj->ni", rotation, noise) * jnp.exp(2 * gaussians.log_scales)
+    return eqx.tree_at(lambda g: g.means, gaussians, gaussians.means + einsum("nij,nj->ni", rotation, local))

@@ -1,0 +1,272 @@
+"""Fitting Gaussians to photos: L1 + D-SSIM, Adam groups as 3DGS, relocation at a constant number of splats."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import lax
+from jaxtyping import Array, Float
+
+from pigjax import io
+from pigjax.core.arguments import checked
+from pigjax.core.camera import Camera
+from pigjax.core.errors import InputError, StaleError
+from pigjax.core.extent import scene_extent
+from pigjax.core.metrics import psnr, ssim
+from pigjax.reconstruction.init import random_points, start_gaussians
+from pigjax.reconstruction.train import (
+    FitConfig,
+    FitState,
+    Photos,
+    count_at,
+    grow,
+    optimizer_of,
+    relocate_dead,
+    train_steps,
+    twist_of,
+)
+from pigjax.splat import Gaussians, bands_of, render
+from pigjax.splatting.sharding import replicate
+
+
+class Progress(NamedTuple):
+    """Where a reconstruction stands."""
+
+    step: int
+    loss: float
+    psnr: float | None  # mean over held-out views [dB], where it was just evaluated
+    ssim: float | None
+    splats: int
+    seconds: float  # spent on steps, compilation included
+
+
+@dataclass
+class Reconstruction:
+    """What a reconstruction hands back."""
+
+    gaussians: Gaussians
+    psnr: dict[str, float]  # per held-out view [dB]
+    ssim: dict[str, float]
+    cameras: Camera  # of the training views, corrected where `pose_rate` asks for it; the held-out ones stay
+    trained_on: tuple[str, ...]  # their names
+    history: list[Progress] = field(default_factory=list)
+    relocated: int = 0
+
+    @property
+    def mean_psnr(self) -> float:
+        """Mean PSNR over the held-out views [dB]; NaN without any."""
+        return float(np.mean(list(self.psnr.values()))) if self.psnr else float("nan")
+
+    @property
+    def mean_ssim(self) -> float:
+        """Mean SSIM over the held-out views; NaN without any."""
+        return float(np.mean(list(self.ssim.values()))) if self.ssim else float("nan")
+
+
+@checked
+def reconstruct(
+    views: io.Views,
+    config: FitConfig = FitConfig(),
+    *,
+    points: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]] | None = None,
+    checkpoint: Path | None = None,
+    previews: Path | None = None,
+    callback: Callable[[Progress], None] | None = None,
+    overwrite: bool = False,
+) -> Reconstruction:
+    """Fit Gaussians to the training views, and score the held-out ones (split "test"). Host.
+
+    Args:
+        views: photos with cameras, and with masks where the settings ask for them.
+        config: steps, splats and rates.
+        points: positions [m] and colours of sparse points; None starts from random ones.
+        checkpoint: file that is written at every evaluation; if it exists the run goes on from it, with the same
+            result as an unbroken one.
+        previews: folder for a picture of the first held-out (or else training) view beside its photo, every
+            `config.preview_every` steps.
+        callback: told the progress every few dozen steps.
+        overwrite: start over where the checkpoint was made from something else, instead of refusing it.
+
+    Raises:
+        StaleError: the checkpoint was made from other photos, cameras, masks, points or settings; it names which.
+        InputError: no training views, too few points, or no masks where the settings need them.
+    """
+    # the capacity of a picture would drop splats without a word
+    config = replace(config, render=replace(config.render, capacity=None, differentiation="reverse"))
+    train = views.subset("train") if "train" in views.splits else views
+    held_out = views.subset("test") if "test" in views.splits else None
+    if points is None:
+        points = random_points(train.cameras, min(config.splats, 5000), seed=config.seed)
+    extent = scene_extent(points[0], name="points").spread
+    pose_rate = optax.exponential_decay(config.pose_rate, config.steps, 0.1)
+    optimizers = optimizer_of(config, extent), optax.adam(pose_rate)
+    bands = bands_of(train.cameras, config.render)
+
+    def start(count: int) -> FitState:
+        gaussians = start_gaussians(*points, count, config.sh_degree, seed=config.seed)
+        poses = jnp.zeros((len(train), 6)) if config.pose_rate else None
+        zero = jnp.zeros((), jnp.int32)
+        return FitState(gaussians, optimizers[0].init(gaussians), poses, optimizers[1].init(poses), zero, zero)
+
+    parts = provenance(views, config, points)
+    state = start(count_at(0, config))
+    if checkpoint is not None and checkpoint.exists():
+        state = _resume(checkpoint, start, config, parts, overwrite)
+    photos = _photos(train, config)
+    if photos.mattes is not None and not photos.mattes.any():
+        raise InputError(f"{_asked(config)}: no mask of the training views has any pixel of it.")
+    scored = None if held_out is None else _scored(held_out, config)
+    state, photos, cameras = replicate((state, photos, train.cameras), bands)
+    result = Reconstruction(state.gaussians, {}, {}, train.cameras, train.names)
+    begun = time.perf_counter()
+    while (step := int(state.step)) < config.steps:
+        if (count := count_at(step, config)) > len(state.gaussians):
+            state = grow(state, count, config)
+        stop = min(config.steps, _next_stop(step, config))
+        state, loss = train_steps(state, cameras, photos, config, optimizers, extent, jnp.asarray(stop - step))
+        state = replicate(state, bands)
+        if config.relocate_every and stop % config.relocate_every == 0 and stop <= config.relocate_until * config.steps:
+            state = relocate_dead(state, config)
+        psnrs: dict[str, float] = {}
+        ssims: dict[str, float] = {}
+        if stop % config.evaluate_every == 0 or stop == config.steps:
+            psnrs, ssims = _score(state.gaussians, scored, config)
+            if checkpoint is not None:
+                io.save_pytree(checkpoint, state, parts=parts)
+        if previews is not None and config.preview_every and stop % config.preview_every == 0:
+            _preview(previews / f"{stop:06d}.png", state.gaussians, held_out or train, config)
+        spent = time.perf_counter() - begun
+        result.history.append(Progress(stop, float(loss), _mean(psnrs), _mean(ssims), len(state.gaussians), spent))
+        if callback is not None:
+            callback(result.history[-1])
+    psnrs, ssims = _score(state.gaussians, scored, config)
+    return replace(
+        result,
+        gaussians=state.gaussians,
+        psnr=psnrs,
+        ssim=ssims,
+        cameras=train.cameras if state.poses is None else train.cameras.nudged(twist_of(state.poses, extent)),
+        relocated=int(state.relocated),
+    )
+
+
+def _mean(scores: dict[str, float]) -> float | None:
+    return float(np.mean(list(scores.values()))) if scores else None
+
+
+def _photos(views: io.Views, config: FitConfig) -> Photos:
+    images = jnp.asarray(views.images)
+    if config.object_id is None and not config.random_background:
+        return Photos(images, None)
+    if views.masks is None:
+        raise InputError(f"{_asked(config)} needs masks: load the views with load_views(..., masks=True).")
+    masks = np.asarray(views.masks)
+    matte = masks > 0 if config.object_id is None else masks == config.object_id
+    mattes = jnp.asarray(matte[..., None], images.dtype)
+    return Photos(images * mattes, mattes)
+
+
+def _asked(config: FitConfig) -> str:
+    if config.object_id is None:
+        return "FitConfig.random_background"
+    return f"FitConfig.object_id = {config.object_id}"
+
+
+def _scored(views: io.Views, config: FitConfig) -> tuple[tuple[str, ...], Camera, Float[Array, "v h w 3"]] | None:
+    """Names, cameras and pictures to score by, without views in which the masks show nothing of what is fitted."""
+    photos = _photos(views, config)
+    if photos.mattes is None:
+        return views.names, views.cameras, photos.images
+    seen = np.nonzero(np.asarray(photos.mattes).any((1, 2, 3)))[0]
+    if not len(seen):
+        return None
+    images = photos.images + (1 - photos.mattes) * config.background
+    return tuple(views.names[k] for k in seen), views.cameras[seen], images[seen]
+
+
+def provenance(views: io.Views, config: FitConfig, points: Any) -> dict[str, str]:
+    """Parts that a reconstruction depends on, by content.
+
+    How often previews are drawn and how many devices share an image do not count.
+    """
+    settings = replace(config, preview_every=0, render=replace(config.render, bands=1))
+    return io.parts_of(
+        {
+            "settings": settings,
+            "photos": io.digest(views.images, views.names, views.splits),
+            "cameras": io.digest(views.cameras),
+            "masks": io.digest(views.masks),
+            "points": io.digest(points),
+            "precision": str(jnp.result_type(float)),
+        }
+    )
+
+
+def _resume(
+    checkpoint: Path, start: Callable[[int], FitState], config: FitConfig, parts: dict[str, str], overwrite: bool
+) -> FitState:
+    """State of a checkpoint, whose number of splats is one of those that the settings pass through.
+
+    The state at the beginning where it is damaged, or made from something else that may be overwritten.
+    """
+    counts = sorted({count_at(step, config) for step in range(0, config.steps + 1, config.grow_every)})
+    damage: InputError | None = None
+    for count in dict.fromkeys([*counts, config.splats]):
+        try:
+            return io.load_pytree(checkpoint, start(count), parts=parts)
+        except StaleError:
+            if not overwrite:
+                raise
+            break
+        except InputError as error:
+            damage = error
+    else:
+        assert damage is not None
+        io.set_aside(checkpoint, damage)
+    return start(count_at(0, config))
+
+
+def _preview(path: Path, gaussians: Gaussians, views: io.Views, config: FitConfig) -> None:
+    frame = render(gaussians, views.cameras[0], config.render, background=config.background, outputs=("rgb",))
+    assert frame.rgb is not None
+    picture = np.clip(np.concatenate([np.asarray(views.images[0]), np.asarray(frame.rgb)], 1), 0, 1)
+    io.write_image(path, picture)
+
+
+def _next_stop(step: int, config: FitConfig) -> int:
+    grows = config.grow_every if config.start_splats is not None else 0
+    return _next_multiple(step, config.relocate_every, config.evaluate_every, config.preview_every, grows, 50)
+
+
+def _next_multiple(step: int, *periods: int) -> int:
+    return min((step // p + 1) * p for p in periods if p)
+
+
+def _score(
+    gaussians: Gaussians, held_out: tuple[tuple[str, ...], Camera, Array] | None, config: FitConfig
+) -> tuple[dict[str, float], dict[str, float]]:
+    """PSNR [dB] and SSIM of each held-out view by name."""
+    if held_out is None:
+        return {}, {}
+    names, cameras, images = held_out
+    psnrs, ssims = _score_views(gaussians, cameras, images, config)
+    return dict(zip(names, map(float, psnrs))), dict(zip(names, map(float, ssims)))
+
+
+@eqx.filter_jit
+def _score_views(gaussians: Gaussians, cameras: Camera, images, config: FitConfig):
+    def one(pair):
+        camera, image = pair
+        rgb = render(gaussians, camera, config.render, background=config.background, outputs=("rgb",)).rgb
+        rgb = jnp.clip(rgb, 0, 1)
+        return psnr(rgb, image), ssim(rgb, image)
+
+    return lax.map(one, (cameras, images))

@@ -1,0 +1,1 @@
+"""Rasterization of Gaussian splats: projection, binning into tiles, compositing, contributions."""
