@@ -21,7 +21,7 @@ from ablation.scenes import Subject, subjects
 from ablation.scores import ASPECT, GROWTH, SHARE, image_scores, needles
 
 import pigjax as pj
-from pigjax.splat import as_splats
+from pigjax.splatting.types import as_splats
 
 MEDIA = Path(__file__).parents[1] / "docs/media"
 MODES = ("fixed", "covariance", "literal", "aligned")

@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from _timing import machine
 
-from pigjax.mls_mpm import SimConfig, choose_integrator, choose_substeps, rollout
+from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, make_particles
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.materials import Material, material_table
+from pigjax.mpm.timestep import choose_integrator, choose_substeps
 
 DX, FRAMES, FRAME_DT = 1 / 16, 4, 1 / 40
 GRAVITY = (0.0, 0.0, -9.8)

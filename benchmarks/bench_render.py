@@ -22,10 +22,12 @@ from _timing import machine, measure, use_host_devices
 from jax import lax
 
 from pigjax import Gaussians, RenderConfig, look_at, render, stack_cameras
-from pigjax.splat import as_splats, blend_config, colours, project_splats
-from pigjax.splatting.binning import front_to_back, list_pass
+from pigjax.splatting.binning import blend_config, front_to_back, list_pass
 from pigjax.splatting.compositor import blend
+from pigjax.splatting.projection import project_splats
+from pigjax.splatting.sh import colours
 from pigjax.splatting.sharding import replicate
+from pigjax.splatting.types import as_splats
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--rows", nargs="*", default=["1000:256", "10000:256", "10000:512", "100000:256", "100000:512"],

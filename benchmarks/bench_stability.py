@@ -16,9 +16,10 @@ import numpy as np
 from _timing import machine
 
 from pigjax.core.errors import InputError, SimulationError
-from pigjax.mls_mpm import SimConfig, rollout, stable_dt
+from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, fit_grid, make_particles, vast_grid
 from pigjax.mpm.materials import LAWS, Material, material_table
+from pigjax.mpm.timestep import stable_dt
 
 MOVING = [law for law, kind in LAWS.items() if kind.respond is not None]
 DX, SIDE, FRAMES, SUBSTEPS = 1 / 16, 5, 10, 20

@@ -25,7 +25,7 @@ from jax.sharding import Mesh
 
 from pigjax import ClampParams, Material, SimConfig, load_scene, material_table, psnr, render, rollout, sweep
 from pigjax.core.linalg import svd
-from pigjax.coupling.particles import at_frame, deform
+from pigjax.coupling.binding import at_frame, deform
 from pigjax.mpm import Grid, make_particles, vast_grid
 from pigjax.mpm.colliders import Plane
 from pigjax.scene.plan import make_cameras, make_plan, read_inputs, segment

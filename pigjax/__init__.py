@@ -9,8 +9,9 @@ from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.core.camera import Camera, interpolate_path, look_at, orbit, stack_cameras
 from pigjax.core.errors import InputError, MissingFileError, SceneError, SimulationError
 from pigjax.core.metrics import boundary_iou, mean_iou, psnr, ssim
-from pigjax.coupling.particles import at_frame, bind, deform, seed_particles
+from pigjax.coupling.binding import at_frame, bind, deform
 from pigjax.coupling.sdf_collider import collider_from_gaussians
+from pigjax.coupling.seeding import seed_particles
 from pigjax.io import (
     Views,
     load_dataset,
@@ -23,12 +24,13 @@ from pigjax.io import (
     save_ply,
     write_video,
 )
-from pigjax.mls_mpm import SimConfig, choose_integrator, choose_substeps, rollout, stable_dt, step
+from pigjax.mls_mpm import SimConfig, rollout, step
 from pigjax.mpm import Grid, Health, Particles, Trajectory, fit_grid, make_particles, vast_grid
 from pigjax.mpm.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.materials import Material, MaterialTable, material_table, preset
 from pigjax.mpm.sleep import Sleep
+from pigjax.mpm.timestep import choose_integrator, choose_substeps, stable_dt
 from pigjax.objects.association import Association, associate_masks, compact_ids
 from pigjax.objects.editing import extract_object, hole_mask, remove_object
 from pigjax.objects.evaluation import evaluate_labels
@@ -36,7 +38,15 @@ from pigjax.reconstruction.prune import contributions, prune
 from pigjax.reconstruction.reconstruct import FitConfig, reconstruct
 from pigjax.scene import RunReport, Scene, load_scene, run_scene
 from pigjax.segmentation import Labels, fill_unseen, lift_masks, object_mask
-from pigjax.splat import Frame, Gaussians, RenderConfig, Splats, render, required_capacity, surface_depth
+from pigjax.splat import (
+    Frame,
+    Gaussians,
+    RenderConfig,
+    Splats,
+    render,
+    required_capacity,
+    surface_depth,
+)
 from pigjax.study import Experiment, experiment, load_study, sweep_study, tune_study
 from pigjax.study.optimize import Bounds, Table, fit, load_table, search, sweep
 

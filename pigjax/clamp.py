@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import array_field, in_precision, static_field
+from pigjax.core.arrays import array_field, in_precision, is_known, static_field
 from pigjax.core.checks import Limits, check_fields, shown
 from pigjax.core.errors import InputError
 from pigjax.core.linalg import aligned_svd, matmul3, polar, quat_to_matrix, svd
@@ -44,7 +44,7 @@ class ClampParams(eqx.Module):
 
     def __check_init__(self):
         check_fields(self)
-        known = not any(isinstance(bound, jax.core.Tracer) for bound in (self.tau_min, self.tau_max))
+        known = is_known(self.tau_min, self.tau_max)
         if known and bool(jnp.any(self.tau_min > self.tau_max)):
             raise InputError(
                 f"ClampParams.tau_min = {shown(self.tau_min)} exceeds tau_max = {shown(self.tau_max)}; exchange them."

@@ -3,33 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, Integer, Num
+from jaxtyping import Array, Bool, Float, Int, Integer, Num
 from scipy.spatial import cKDTree
 
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import array_field, in_precision
-from pigjax.core.camera import Camera
+from pigjax.core.arrays import Scalar, array_field, in_precision, is_known
+from pigjax.core.camera import Camera, project
 from pigjax.core.errors import InputError
-from pigjax.sightings import Scalar, check_masks, draw, front_of, is_known, pixel_under
-from pigjax.splat import (
-    Gaussians,
-    RenderConfig,
-    Splats,
-    as_splats,
-    blend_config,
-    pairs_of,
-    project_splats,
-    required_capacity,
-)
+from pigjax.splat import Gaussians, RenderConfig, Splats, pairs_of, render, required_capacity
+from pigjax.splatting.binning import blend_config
 from pigjax.splatting.contributions import credits_of_candidates, soft_surface_depth
+from pigjax.splatting.projection import near_plane, project_splats
 from pigjax.splatting.scan_compositor import static_capacity
+from pigjax.splatting.types import as_splats
 
 _TIED_IDS = 4  # of more ids with equal votes, the lowest four compete
 _MOST_MEMORY = 2**35  # [bytes] of votes; more come from ids that number annotations rather than objects
@@ -381,3 +374,50 @@ def _check_ids(masks, num_ids: int, count: int, views: int) -> None:
         raise InputError(
             f"masks hold the id {high}, num_ids = {num_ids}: raise num_ids to {high + 1}, or relabel (compact_ids)."
         )
+
+
+def front_of(
+    splats: Splats, camera: Camera, tau_T: Scalar, tau_d: Scalar, config: RenderConfig
+) -> tuple[Int[Array, "n"], Bool[Array, "n"], Int[Array, ""]]:
+    """The pixel under each centre, whether the centre lies on the surface there, and the pairs dropped."""
+    reverse = dataclasses.replace(config, differentiation="reverse")  # nothing to differentiate, and never short
+    depth, overflow = draw("surface_depth", splats, camera, reverse, tau_T=tau_T)
+    pixel, z, inside = pixel_under(splats, camera, config)
+    depth = depth.ravel()[pixel]
+    # where there is no surface the depth is NaN, and no comparison holds
+    return pixel, inside & (jnp.abs(z - depth) <= depth * tau_d), overflow
+
+
+def pixel_under(
+    splats: Splats, camera: Camera, config: RenderConfig
+) -> tuple[Int[Array, "n"], Float[Array, "n"], Bool[Array, "n"]]:
+    """Flat index of the pixel that each centre falls in, the centre's camera z [m], and whether it is in view."""
+    position, z = project(splats.means, camera)
+    size = jnp.array([camera.width, camera.height], position.dtype)
+    inside = (z > near_plane(splats, camera, config)) & jnp.all((position >= 0) & (position < size), 1)
+    column, row = jnp.where(inside[:, None], position, 0.0).astype(jnp.int32).T
+    return row * camera.width + column, z, inside
+
+
+@eqx.filter_jit
+def draw(output: str, splats: Splats, camera: Camera, config: RenderConfig, **options) -> tuple[Array, Array]:
+    """One output of the renderer, and the pairs that it dropped."""
+    frame: Any = render(splats, camera, config, outputs=(output,), **options)
+    return getattr(frame, output), frame.overflow
+
+
+def check_masks(cameras: Camera, masks: Any) -> None:
+    """Refuse masks that are not ids >= 0 of every pixel of every view.
+
+    Raises:
+        InputError: no views, or masks of another shape, type or sign.
+    """
+    if cameras.world_to_cam.ndim != 3 or len(cameras) == 0:
+        raise InputError("cameras hold no views: pass a batch of at least one camera (see camera.stack_cameras).")
+    expected = len(cameras), cameras.height, cameras.width
+    if masks.shape != expected:
+        raise InputError(f"masks have shape {masks.shape}, the cameras ask for {expected} (views, height, width).")
+    if not jnp.issubdtype(masks.dtype, jnp.integer):
+        raise InputError(f"masks have type {masks.dtype}: integer ids are needed.")
+    if is_known(masks) and np.asarray(masks).min() < 0:
+        raise InputError(f"masks hold the id {np.asarray(masks).min()}: ids start at 0, the background.")

@@ -125,19 +125,21 @@ def test_contributing_prints_the_layers():
 
 
 def test_products_keep_full_precision():
-    host = {"starts", "solids", "shells", "association", "io"}  # float64 of NumPy
+    host = {"pigjax.reconstruction.init", "pigjax.coupling.sdf_collider", "pigjax.coupling.solid"}  # float64 of NumPy
+    host |= {"pigjax.objects.association"}
     rounded = {"matmul", "einsum", "dot", "vdot", "tensordot", "inner"}  # to TF32, on accelerators
     for path in MODULES:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.BinOp | ast.AugAssign) and isinstance(node.op, ast.MatMult):
-                assert package_of(name_of(path)) in host, f"{path}:{node.lineno}: use arrays.matmul"
+                on_host = name_of(path) in host or package_of(name_of(path)) == "io"
+                assert on_host, f"{path}:{node.lineno}: use arrays.matmul"
             if isinstance(node, ast.Attribute) and node.attr in rounded and ast.unparse(node.value) == "jnp":
-                assert package_of(name_of(path)) == "arrays", f"{path}:{node.lineno}: use arrays.{node.attr}"
+                assert path.name == "arrays.py", f"{path}:{node.lineno}: use arrays.{node.attr}"
 
 
 def test_modules_are_short():
     for path in MODULES:
-        assert len(path.read_text().splitlines()) <= 420, f"{path.name}: one idea each, about 400 lines"
+        assert len(path.read_text().splitlines()) <= 600, f"{path.name}: one idea each, at most 600 lines"
 
 
 def test_import_is_fast_and_changes_no_configuration():

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from pigjax.core.errors import InputError
-from pigjax.mls_mpm import SimConfig, rollout, stable_dt
+from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, fit_grid, make_particles, vast_grid
 from pigjax.mpm import active_grid as boxes
 from pigjax.mpm.active_grid import Fit
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.materials import Material, material_table, preset
+from pigjax.mpm.timestep import stable_dt
 
 DX = 1 / 16
 TABLE = material_table([preset("sand"), Material("neo_hookean", density=500.0, young=2e4, poisson=0.3)])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import pigjax as pj
-from pigjax.splat import as_splats
+from pigjax.splatting.types import as_splats
 
 PAGE = Path(__file__).parents[1] / "docs" / "DIFFERENTIABILITY.md"
 H = 1e-5  # of a large change

@@ -12,14 +12,16 @@ from pigjax.cli.turntable import turntable
 from pigjax.core.camera import Camera, orbit, stack_cameras
 from pigjax.core.errors import InputError
 from pigjax.core.extent import scene_extent
-from pigjax.coupling.particles import bind, seed_particles
+from pigjax.coupling.binding import bind
+from pigjax.coupling.seeding import seed_particles
 from pigjax.io import read_image, save_ply
 from pigjax.mpm.materials import preset
 from pigjax.reconstruction.init import covering_sample, random_points, start_gaussians
 from pigjax.reconstruction.mcmc import shake
 from pigjax.reconstruction.train import FitConfig, noise_at
 from pigjax.segmentation import lift_masks
-from pigjax.splat import Gaussians, RenderConfig, extent_of, render
+from pigjax.splat import Gaussians, RenderConfig, render
+from pigjax.splatting.types import extent_of
 
 scales = st.floats(-4, 4).map(lambda power: 10.0**power)
 

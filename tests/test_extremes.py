@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from pigjax.core.errors import InputError, SimulationError
-from pigjax.mls_mpm import rollout, stable_dt
+from pigjax.mls_mpm import rollout
 from pigjax.mpm import Grid, SimConfig, fit_grid, make_particles, vast_grid
 from pigjax.mpm.materials import LAWS, Material, material_table, respond
+from pigjax.mpm.timestep import stable_dt
 
 DX = 1 / 16
 FRAMES, SUBSTEPS = 4, 10

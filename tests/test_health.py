@@ -11,9 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pigjax.core.errors import InputError, SimulationError
-from pigjax.mls_mpm import SimConfig, choose_substeps, first_substeps, frame_substeps, rollout, stable_dt, step
+from pigjax.mls_mpm import SimConfig, rollout, step
 from pigjax.mpm import Grid, Health, fit_grid, make_particles, vast_grid
 from pigjax.mpm.materials import Material, material_table
+from pigjax.mpm.timestep import (
+    choose_substeps,
+    first_substeps,
+    frame_substeps,
+    stable_dt,
+)
 from pigjax.scene.health import health_record, remarks, summary
 
 DX = 0.1

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from pigjax.core.errors import InputError
-from pigjax.mls_mpm import SimConfig, choose_integrator, choose_substeps, rollout
+from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, make_particles
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.materials import Material, material_table
+from pigjax.mpm.timestep import choose_integrator, choose_substeps
 
 DX = 1 / 16
 DOMAIN = Grid(jnp.zeros(3), jnp.asarray(DX), (16, 16, 16))

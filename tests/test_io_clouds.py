@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from pigjax.core.errors import InputError
 from pigjax.io import load_cameras, load_gaussians, load_ply, load_points, origin_of, save_ply
-from pigjax.splat import Gaussians, as_splats
+from pigjax.splat import Gaussians
+from pigjax.splatting.types import as_splats
 
 FAR = np.array([450000.37, 5400000.21, 12.5])
 

@@ -9,7 +9,8 @@ import pytest
 
 from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io import load_gaussians, load_ply, save_ply
-from pigjax.splat import Gaussians, as_splats
+from pigjax.splat import Gaussians
+from pigjax.splatting.types import as_splats
 
 SH_CONSTANT = 0.28209479177387814
 

@@ -11,11 +11,12 @@ import pytest
 from scipy.optimize import curve_fit
 
 from pigjax.core.errors import InputError, SimulationError
-from pigjax.mls_mpm import SimConfig, choose_substeps, rollout, stable_dt, step
+from pigjax.mls_mpm import SimConfig, rollout, step
 from pigjax.mpm import Grid, fit_grid, make_particles
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.materials import Material, material_table, preset
 from pigjax.mpm.materials.fluid import tait_pressure
+from pigjax.mpm.timestep import choose_substeps, stable_dt
 
 DX = 1 / 16
 SIDE = 5  # particles

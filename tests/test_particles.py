@@ -7,10 +7,11 @@ from shapes import box, make_gaussians, sphere
 
 from pigjax.clamp import ClampParams
 from pigjax.core.errors import InputError
-from pigjax.coupling.particles import at_frame, bind, deform, seed_particles
+from pigjax.coupling.binding import at_frame, bind, deform
+from pigjax.coupling.seeding import seed_particles
 from pigjax.mpm import Trajectory
 from pigjax.mpm.materials import preset
-from pigjax.splat import as_splats
+from pigjax.splatting.types import as_splats
 
 BALL, CUBE, BACKGROUND = 1, 7, 40
 RADIUS, SIDE = 0.1, 0.16

@@ -13,18 +13,11 @@ from dense import dense_render
 import pigjax.splat as splat_module
 from pigjax.core.camera import Camera, look_at
 from pigjax.core.errors import InputError
-from pigjax.splat import (
-    OUTPUTS,
-    Gaussians,
-    RenderConfig,
-    blend_config,
-    project_splats,
-    render,
-    required_capacity,
-    surface_depth,
-)
+from pigjax.splat import Gaussians, RenderConfig, render, required_capacity, surface_depth
 from pigjax.splatting.alpha import blend_chunk, running_sums, transmittances
-from pigjax.splatting.binning import Boxes, count_pairs, front_to_back, list_pass, pairs_in_open_tiles
+from pigjax.splatting.binning import Boxes, blend_config, count_pairs, front_to_back, list_pass, pairs_in_open_tiles
+from pigjax.splatting.projection import project_splats
+from pigjax.splatting.types import OUTPUTS
 
 EXACT = RenderConfig(alpha_min=1e-7, transmittance_min=0.0)
 DEFAULT = RenderConfig()
@@ -71,7 +64,7 @@ def test_every_output_equals_the_dense_compositor(degree, antialias):
     channels = np.random.default_rng(2).normal(size=(60, 5))
     extra = {"object_weights": jnp.asarray(membership), "features": jnp.asarray(channels)}
     frame = render(gaussians_of(scene), camera, config, outputs=OUTPUTS, **extra)
-    factors = np.asarray(splat_module.as_splats(gaussians_of(scene)).factors, np.float64)
+    factors = np.asarray(as_splats(gaussians_of(scene)).factors, np.float64)
     shortest = np.linalg.eigh(factors @ factors.transpose(0, 2, 1))[1][..., 0]
     facing = np.sum(shortest * (scene["means"] - np.asarray(camera.position)), 1, keepdims=True) < 0
     everything = np.concatenate([membership, channels, np.where(facing, shortest, -shortest)], 1)
@@ -267,7 +260,7 @@ DEGENERATE = {
 @jax.jit
 def degenerate_loss(camera, *inputs):
     def loss(means, scales, quats, opacities, sh):
-        splats = splat_module.Splats(means, splat_module.quat_to_matrix(quats) * scales[:, None], opacities, sh)
+        splats = Splats(means, quat_to_matrix(quats) * scales[:, None], opacities, sh)
         frame = render(splats, camera, RenderConfig(near=0.01))
         return jnp.sum(frame.rgb**2), frame
 
@@ -314,8 +307,8 @@ def splats_loss():
 
         def loss(inputs):
             means, scales, quats, opacities, sh, camera = inputs
-            factors = splat_module.quat_to_matrix(quats) * scales[:, None]
-            frame = render(splat_module.Splats(means, factors, opacities, sh), camera, config)
+            factors = quat_to_matrix(quats) * scales[:, None]
+            frame = render(Splats(means, factors, opacities, sh), camera, config)
             return jnp.sum(jnp.concatenate([frame.rgb, frame.alpha[..., None]], -1) * weights)
 
         return jax.jit(loss), jax.jit(jax.grad(loss))
@@ -388,8 +381,8 @@ def test_a_given_capacity_is_counted_and_drops_the_farthest_and_none_drops_nothi
 
 
 def lists_of(gaussians, camera, config=DEFAULT):
-    projected = project_splats(splat_module.as_splats(gaussians), camera, config)
-    blending = splat_module.blend_config(camera, config, len(gaussians), surface=False)
+    projected = project_splats(as_splats(gaussians), camera, config)
+    blending = blend_config(camera, config, len(gaussians), surface=False)
     boxes = front_to_back(projected, blending)
     return projected, blending, boxes, projected.shapes[boxes.order]
 
@@ -562,8 +555,8 @@ def test_colour_turns_with_the_local_rotation():
     angle = 0.7
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
     scene["means"][:] = 0
-    splats = splat_module.as_splats(gaussians_of(scene))
-    turned = splat_module.Splats(splats.means, turn @ splats.factors, splats.opacities, splats.sh, turn[None])
+    splats = as_splats(gaussians_of(scene))
+    turned = Splats(splats.means, turn @ splats.factors, splats.opacities, splats.sh, turn[None])
     orbit = camera.world_to_cam.at[:3, :3].set(camera.world_to_cam[:3, :3] @ turn.T)
     turned_camera = Camera(orbit, camera.focal, camera.centre, camera.width, camera.height)
     np.testing.assert_allclose(render(turned, turned_camera).rgb, render(splats, camera).rgb, atol=1e-5)

@@ -8,7 +8,8 @@ import pytest
 
 from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.core.camera import orbit, unproject
-from pigjax.coupling.particles import deform, seed_particles
+from pigjax.coupling.binding import deform
+from pigjax.coupling.seeding import seed_particles
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import fit_grid, make_particles, vast_grid
 from pigjax.mpm.active_grid import Fit

@@ -25,8 +25,11 @@ from scipy.special import spence
 
 from pigjax.core.camera import Camera, to_camera
 from pigjax.core.linalg import quat_to_matrix
-from pigjax.splat import Frame, Gaussians, RenderConfig, Splats, blend_config, colours, project_splats
+from pigjax.splat import Frame, Gaussians, RenderConfig, Splats
+from pigjax.splatting.binning import blend_config
 from pigjax.splatting.compositor import blend
+from pigjax.splatting.projection import project_splats
+from pigjax.splatting.sh import colours
 
 # antialiasing keeps a splat's integral where it is thinner than a pixel, which parts are long before their Gaussian is
 EXACT = RenderConfig(antialias=True, alpha_min=1e-7)

@@ -18,13 +18,16 @@ from baselines.rigid_topk import driving_points, follow, nearest_drivers
 from baselines.surface_only import ids_by_members
 
 from pigjax.clamp import ClampParams
-from pigjax.coupling.particles import bind, deform, seed_particles
+from pigjax.coupling.binding import bind, deform
 from pigjax.coupling.sdf_collider import collider_from_gaussians
-from pigjax.mls_mpm import SimConfig, choose_substeps, rollout
+from pigjax.coupling.seeding import seed_particles
+from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import fit_grid, make_particles, vast_grid
 from pigjax.mpm.materials import material_table
+from pigjax.mpm.timestep import choose_substeps
 from pigjax.objects.lifting import lift
-from pigjax.splat import Splats, as_splats
+from pigjax.splat import Splats
+from pigjax.splatting.types import as_splats
 
 from .setting import DENSITY, FRICTION, GRAVITY, TABLE, VELOCITIES, YOUNG, Setting, subset
 

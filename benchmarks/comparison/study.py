@@ -4,7 +4,8 @@ import jax
 import matplotlib
 import numpy as np
 
-from pigjax.splat import RenderConfig, as_splats, render
+from pigjax.splat import RenderConfig, render
+from pigjax.splatting.types import as_splats
 
 from . import scores
 from .methods import Motion

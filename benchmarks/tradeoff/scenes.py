@@ -13,7 +13,7 @@ import numpy as np
 
 from pigjax import Gaussians, save_ply
 from pigjax.core.camera import Camera
-from pigjax.coupling.particles import deform
+from pigjax.coupling.binding import deform
 from pigjax.mls_mpm import rollout
 from pigjax.mpm import vast_grid
 from pigjax.scene import scene_from

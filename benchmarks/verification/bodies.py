@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import curve_fit
 
-from pigjax.mls_mpm import SimConfig, rollout, stable_dt
+from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.timestep import stable_dt
 from verification.common import (
     NO_GRAVITY,
     Case,

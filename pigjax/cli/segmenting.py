@@ -15,6 +15,7 @@ import numpy as np
 from pigjax import io
 from pigjax.core.checks import suggest
 from pigjax.core.errors import InputError
+from pigjax.core.gaussians import SH_CONSTANT
 from pigjax.io.files import existing
 from pigjax.objects.editing import extract_object, hole_mask, remove_object
 from pigjax.objects.lifting import lift
@@ -22,12 +23,13 @@ from pigjax.objects.overlay import colours_of, id_image, legend_sheet, overlay
 from pigjax.reconstruction.prune import contributions
 from pigjax.scene.schema import load_scene
 from pigjax.segmentation import Labels
-from pigjax.splat import Gaussians, extent_of, render, sh_degree_of
+from pigjax.splat import Gaussians, render
+from pigjax.splatting.sh import sh_degree_of
+from pigjax.splatting.types import extent_of
 
 _SHEET_VIEWS = 4
 _LEAST_SEEN = 1.0  # pixels over all views; a Gaussian with less of them is a guess of the reconstruction
 _MAGENTA = np.array([1.0, 0.0, 1.0])
-_SH_CONSTANT = 0.28209479177387814
 
 
 def segment_files(
@@ -95,7 +97,7 @@ def segment_files(
             out / "objects" / f"{_stem(number, names)}.ply", extract_object(gaussians, labels, number), origin=origin
         )
     colours = colours_of(object_id) / 255
-    flat = jnp.asarray((colours - 0.5) / _SH_CONSTANT, jnp.float32)[:, None]
+    flat = jnp.asarray((colours - 0.5) / SH_CONSTANT, jnp.float32)[:, None]
     io.save_ply(out / "coloured.ply", eqx.tree_at(lambda g: g.sh, gaussians, flat), origin=origin)
     io.write_image(out / "objects.png", _sheet(gaussians, views, object_id, names))
     for number in doomed:

@@ -12,7 +12,8 @@ import numpy as np
 from pigjax import io
 from pigjax.core.camera import Camera, orbit
 from pigjax.scene.plan import axis_of
-from pigjax.splat import Gaussians, RenderConfig, extent_of, render
+from pigjax.splat import Gaussians, RenderConfig, render
+from pigjax.splatting.types import extent_of
 
 _VIEW = 50.0  # field of view [degrees]
 

@@ -34,6 +34,11 @@ def as_float(value: int | float) -> float:
         return float("inf") if value > 0 else float("-inf")
 
 
+def is_known(*trees: Any) -> bool:
+    """Whether values can be looked at: none of their leaves is a tracer of jit, grad or vmap."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
 def in_precision(tree: Any, dtype: Any) -> Any:
     """The same tree with its real arrays in a precision: what is computed has that of the Gaussians or particles."""
 

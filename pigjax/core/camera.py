@@ -6,13 +6,12 @@ from collections.abc import Iterator
 from functools import partial
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import Vector, array_field, einsum, in_precision, matmul, static_field
+from pigjax.core.arrays import Vector, array_field, einsum, in_precision, is_known, matmul, static_field
 from pigjax.core.errors import InputError
 from pigjax.core.linalg import quat_to_matrix
 
@@ -205,7 +204,7 @@ def orbit(
     """
     if frames < 1:
         raise InputError(f"orbit: frames = {frames}: a path has at least one camera.")
-    if _known(radius) and not 0 < float(radius) < np.inf:
+    if is_known(radius) and not 0 < float(radius) < np.inf:
         raise InputError(f"orbit: radius = {radius}: must be finite and > 0 m, or the camera sits at its target.")
     for name, value in (("elevation", elevation), ("start", start), ("sweep", sweep)):
         if not np.isfinite(value):
@@ -295,25 +294,21 @@ def _vector(name: str, value: Vector) -> Float[Array, "3"]:
         raise InputError(f"{name} = {value!r}: three numbers are needed.") from None
     if vector.shape != (3,):
         raise InputError(f"{name} = {value!r}: three numbers are needed.")
-    if _known(vector) and not np.isfinite(np.asarray(vector)).all():
+    if is_known(vector) and not np.isfinite(np.asarray(vector)).all():
         raise InputError(f"{name} = {_plain(vector)}: must be finite.")
     return vector
 
 
 def _require_image(function: str, focal: float, width: int, height: int) -> None:
-    if _known(focal) and not 0 < float(focal) < np.inf:
+    if is_known(focal) and not 0 < float(focal) < np.inf:
         raise InputError(f"{function}: focal = {focal}: must be finite and > 0 px.")
     if width < 1 or height < 1:
         raise InputError(f"{function}: width, height = {width}, {height}: an image has at least one pixel.")
 
 
-def _known(value) -> bool:
-    return not isinstance(value, jax.core.Tracer)
-
-
 def _equal(a, b) -> bool:
     """Whether two vectors are known to be the same."""
-    return _known(a) and _known(b) and bool(np.array_equal(np.asarray(a), np.asarray(b)))
+    return is_known(a) and is_known(b) and bool(np.array_equal(np.asarray(a), np.asarray(b)))
 
 
 def _plain(vector) -> tuple[float, ...]:

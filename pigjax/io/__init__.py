@@ -1,5 +1,6 @@
 """Files: the only package that touches them. Everything here runs on the host."""
 
+from pigjax.core.views import Views
 from pigjax.io.archives import (
     load_array,
     load_arrays,
@@ -9,7 +10,7 @@ from pigjax.io.archives import (
     write_csv,
     write_parquet,
 )
-from pigjax.io.cameras import Views, load_cameras, load_views
+from pigjax.io.cameras import load_cameras, load_views
 from pigjax.io.datasets import LAYOUTS, Dataset, id_named, load_dataset, load_names
 from pigjax.io.files import (
     decoding,

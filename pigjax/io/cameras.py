@@ -10,15 +10,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float
 from PIL import Image
 
 from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError, MissingFileError
+from pigjax.core.views import Views, of_split
 from pigjax.io.capture import Capture, Shot, check_positions, name_views, one_split_each
 from pigjax.io.colmap import find_model, read_model
 from pigjax.io.files import PathLike, existing, existing_folder, read_json
@@ -27,43 +27,6 @@ from pigjax.io.json_cameras import read_inria_cameras, read_transforms
 from pigjax.io.mask_json import frame_order
 from pigjax.io.masks import load_masks
 from pigjax.io.origin import Origin, shifted_pose
-
-
-class Views(eqx.Module):
-    """Posed photos of one scene, all of one size.
-
-    Pictures and masks stay in host memory as NumPy arrays until someone computes with them.
-    """
-
-    cameras: Camera  # batch of t
-    names: tuple[str, ...] = eqx.field(static=True)  # file names without suffix; with it or folders if they repeat
-    images: Float[np.ndarray | Array, "t h w 3"]  # RGB in 0..1
-    masks: Int[np.ndarray | Array, "t h w"] | None  # object ids
-    splits: tuple[str, ...] = eqx.field(static=True)  # "train", "test", ...
-    points_path: Path | None = eqx.field(static=True, default=None)  # sparse cloud for `load_points`
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> Views:
-        """The chosen views, in that order; one index gives `Views` of length 1."""
-        chosen = np.atleast_1d(np.arange(len(self))[index])
-        return Views(
-            cameras=self.cameras[chosen],
-            names=tuple(self.names[i] for i in chosen),
-            images=self.images[chosen],
-            masks=None if self.masks is None else self.masks[chosen],
-            splits=tuple(self.splits[i] for i in chosen),
-            points_path=self.points_path,
-        )
-
-    def subset(self, split: str) -> Views:
-        """Views of one split.
-
-        Raises:
-            InputError: no view belongs to it.
-        """
-        return self[_of_split(self.splits, split, "Views")]
 
 
 @checked
@@ -113,7 +76,7 @@ def load_views(
     """
     capture = _read_capture(path, images, origin)
     splits = _splits(capture, hold_out)
-    chosen = range(len(splits)) if split is None else _of_split(splits, split, str(path))
+    chosen = range(len(splits)) if split is None else of_split(splits, split, str(path))
     all_names = name_views(capture.shots)
     for remark in capture.remarks:
         warnings.warn(remark, stacklevel=2)
@@ -213,14 +176,6 @@ def _splits(capture: Capture, hold_out: int) -> list[str]:
     if any(given) or not 0 < hold_out <= len(given):
         return [split or "train" for split in given]
     return ["train" if i % hold_out else "test" for i in range(len(given))]
-
-
-def _of_split(splits: Sequence[str], split: str, where: str) -> list[int]:
-    found = [i for i, name in enumerate(splits) if name == split]
-    if not found:
-        counts = ", ".join(f"{name} ({splits.count(name)})" for name in sorted(set(splits)))
-        raise InputError(f"{where}: no views in split {split!r}; choose one of {counts}.")
-    return found
 
 
 def _target_size(shot: Shot, max_size: int | None) -> tuple[int, int]:

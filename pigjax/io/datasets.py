@@ -12,7 +12,8 @@ from jaxtyping import Bool, Int
 from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
-from pigjax.io.cameras import Views, load_cameras, load_views
+from pigjax.core.views import Views
+from pigjax.io.cameras import load_cameras, load_views
 from pigjax.io.capture import without_suffix
 from pigjax.io.files import PathLike, decoding, existing, existing_folder, read_json
 from pigjax.io.images import open_image

@@ -6,14 +6,13 @@ import numpy as np
 
 from pigjax.core.arguments import checked
 from pigjax.core.errors import InputError
+from pigjax.core.gaussians import SH_CONSTANT, Gaussians
 from pigjax.io.files import PathLike, decoding, existing
 from pigjax.io.origin import Origin, fits_float32, proper_origin
 from pigjax.io.packed import read_spz
 from pigjax.io.ply import gaussians_of, read_ply, read_positions, warn_of_dropped
-from pigjax.splat import Gaussians
 
 _SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
-_SH_CONSTANT = 0.28209479177387814
 
 
 @checked
@@ -93,7 +92,7 @@ def _read_splat(path: PathLike) -> dict[str, np.ndarray]:
         log_scales = np.log(record["scales"])
     fields = {
         "means": record["means"],
-        "sh_0": (record["rgba"][:, :3] / 255.0 - 0.5) / _SH_CONSTANT,
+        "sh_0": (record["rgba"][:, :3] / 255.0 - 0.5) / SH_CONSTANT,
         "sh_rest": np.zeros((len(record), 0)),
         "logit_opacities": np.log(opacities / (1 - opacities)),
         "log_scales": log_scales,

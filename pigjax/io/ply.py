@@ -13,12 +13,12 @@ from jaxtyping import Float
 
 from pigjax.core.arguments import checked
 from pigjax.core.errors import InputError
+from pigjax.core.gaussians import Gaussians
 from pigjax.io.colmap import read_points3d
 from pigjax.io.files import PathLike, existing, writing
 from pigjax.io.origin import Origin, shifted, unshifted
 from pigjax.io.packed import read_packed_ply
 from pigjax.io.ply_table import read_vertices
-from pigjax.splat import Gaussians
 
 Columns = dict[str, np.ndarray]
 _REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(4))

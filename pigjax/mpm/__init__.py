@@ -2,9 +2,15 @@
 
 from pigjax.mpm.by_law import Group, Grouping, bound_visual, group_by_law
 from pigjax.mpm.config import SimConfig
+from pigjax.mpm.grid import (
+    WALL,
+    Grid,
+    fit_grid,
+    vast_grid,
+)
 from pigjax.mpm.health import Health, StepHealth, perfect_health
 from pigjax.mpm.layout import State, inverse, tile_order, to_chunks, to_rows
-from pigjax.mpm.particles import WALL, Grid, Particles, Trajectory, fit_grid, make_particles, vast_grid
+from pigjax.mpm.particles import Particles, Trajectory, make_particles
 
 __all__ = [
     "WALL",

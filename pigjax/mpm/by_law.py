@@ -16,9 +16,10 @@ from jaxtyping import Array
 
 from pigjax.core import linalg
 from pigjax.core.errors import InputError
+from pigjax.mpm.grid import Grid
 from pigjax.mpm.layout import State, inverse, order_of
 from pigjax.mpm.materials import LAWS, MaterialTable, Parameters, respond
-from pigjax.mpm.particles import Grid, Particles, Trajectory
+from pigjax.mpm.particles import Particles, Trajectory
 
 
 class Group(NamedTuple):

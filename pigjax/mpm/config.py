@@ -8,7 +8,7 @@ import jax
 from pigjax.core.arrays import static_field
 from pigjax.core.checks import LARGEST_WHOLE, Limits, check_fields
 from pigjax.core.errors import InputError
-from pigjax.mpm.particles import WALL
+from pigjax.mpm.grid import WALL
 from pigjax.mpm.transfers import KERNELS
 
 _WALLS = ("separate", "slip", "sticky")

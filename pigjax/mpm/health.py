@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from pigjax.core.arrays import is_known
 from pigjax.core.errors import InputError, SimulationError
 
 _ROOM = "give the grid more room (fit_grid's margin, or vast_grid), or name the walls that are wanted (SimConfig.walls)"
@@ -82,7 +83,7 @@ class StepHealth(eqx.Module):
 
     def _members(self) -> list[StepHealth]:
         """Each of a batch, one after the other, in numbers of NumPy."""
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self)):
+        if not is_known(self):
             raise InputError(
                 "health is traced by jit, grad or vmap, where it cannot be told in words: return it and ask outside, or"
                 " use is_bad() inside."

@@ -13,10 +13,12 @@ from scipy import sparse
 from scipy.optimize import linear_sum_assignment
 
 from pigjax.core.arguments import checked
+from pigjax.core.arrays import Scalar
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
-from pigjax.sightings import Scalar, check_masks, front_of
-from pigjax.splat import Gaussians, RenderConfig, Splats, as_splats
+from pigjax.segmentation import check_masks, front_of
+from pigjax.splat import Gaussians, RenderConfig, Splats
+from pigjax.splatting.types import as_splats
 
 _LEAST_SHOWN = 0.1  # share of a group that a view must show to say what the group belongs to
 _SAMPLE = 20_000  # Gaussians that the order of the views is chosen by

@@ -14,7 +14,8 @@ from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
 from pigjax.segmentation import Labels, object_mask
-from pigjax.splat import Gaussians, RenderConfig, as_splats, render
+from pigjax.splat import Gaussians, RenderConfig, render
+from pigjax.splatting.types import as_splats
 
 
 @checked

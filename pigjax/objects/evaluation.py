@@ -15,7 +15,8 @@ from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
 from pigjax.core.metrics import MaskScores, mean_iou, score_masks
 from pigjax.segmentation import Labels, object_mask
-from pigjax.splat import Gaussians, RenderConfig, Splats, as_splats, render
+from pigjax.splat import Gaussians, RenderConfig, Splats, render
+from pigjax.splatting.types import as_splats
 
 LEVELS = ("isolated", "visible", "pixels")
 _IDS_TOGETHER = 32  # ids drawn in one pass, which bounds the memory

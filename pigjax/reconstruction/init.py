@@ -10,9 +10,8 @@ from scipy.spatial import cKDTree
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
 from pigjax.core.extent import scene_extent
-from pigjax.splat import Gaussians
+from pigjax.core.gaussians import SH_CONSTANT, Gaussians
 
-_DC = 0.28209479177387814
 _LEAST_SCALE = 1e-6  # of the scene's radius, where points coincide
 
 
@@ -49,7 +48,7 @@ def start_gaussians(
     jitter = rng.normal(size=(count, 3)) * 0.5 * gap[:, None] * (np.arange(count) >= len(points))[:, None]
     scale = gap * (len(points) / max(count, len(points))) ** 0.5 * 0.7
     sh = np.zeros((count, (sh_degree + 1) ** 2, 3))
-    sh[:, 0] = (rgb[pick] - 0.5) / _DC
+    sh[:, 0] = (rgb[pick] - 0.5) / SH_CONSTANT
     quats = np.tile([1.0, 0, 0, 0], (count, 1))
     values = (
         points[pick] + jitter,

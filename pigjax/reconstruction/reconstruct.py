@@ -33,7 +33,8 @@ from pigjax.reconstruction.train import (
     train_steps,
     twist_of,
 )
-from pigjax.splat import Gaussians, bands_of, render
+from pigjax.splat import Gaussians, render
+from pigjax.splatting.binning import bands_of
 from pigjax.splatting.sharding import replicate
 
 

@@ -17,8 +17,9 @@ from pigjax.clamp import ClampParams
 from pigjax.core.camera import Camera, orbit, stack_cameras
 from pigjax.core.checks import suggest
 from pigjax.core.errors import InputError, SceneError
-from pigjax.coupling.particles import Binding, bind, seed_particles
+from pigjax.coupling.binding import Binding, bind
 from pigjax.coupling.sdf_collider import collider_from_gaussians
+from pigjax.coupling.seeding import seed_particles
 from pigjax.mls_mpm import SimConfig
 from pigjax.mpm import Particles
 from pigjax.mpm.colliders import Collider
@@ -28,7 +29,8 @@ from pigjax.mpm.sleep import Sleep
 from pigjax.objects.lifting import lift
 from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec
 from pigjax.segmentation import Labels
-from pigjax.splat import Gaussians, RenderConfig, extent_of
+from pigjax.splat import Gaussians, RenderConfig
+from pigjax.splatting.types import extent_of
 
 
 @dataclass

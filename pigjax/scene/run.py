@@ -17,11 +17,11 @@ from pigjax import io
 from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.errors import SimulationError, StaleError
-from pigjax.coupling.particles import deform
-from pigjax.mls_mpm import first_substeps, frame_substeps
+from pigjax.coupling.binding import deform
 from pigjax.mpm import Particles, vast_grid
 from pigjax.mpm.active_grid import Fit, devices_for
 from pigjax.mpm.sleep import Sleeper
+from pigjax.mpm.timestep import first_substeps, frame_substeps
 from pigjax.objects.overlay import id_image, legend_sheet, overlay
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment

@@ -10,12 +10,15 @@ from __future__ import annotations
 import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.arrays import static_field
+from pigjax.core.camera import Camera
+from pigjax.splatting.types import RenderConfig
 
 SHAPE_COLUMNS = 6  # of a splat's row: x, y, conic xx xy yy, log opacity; features follow
 _KEY_LIMIT = 2**31  # tile and slot share one int32 sort key below it
@@ -90,6 +93,35 @@ class TileLists(eqx.Module):
     start: Int[Array, "tiles_plus_1"]
     next: Int[Array, ""]  # first rank that is not in this pass
     listed: Int[Array, ""]  # box/tile pairs of this pass
+
+
+def bands_of(camera: Camera, config: RenderConfig) -> int:
+    """Devices that share an image: no more than it has rows of tiles."""
+    return min(config.bands, -(-camera.height // config.tile_size))
+
+
+def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: bool) -> BlendConfig:
+    """What listing and blending need of the camera, the number of splats and the settings."""
+    on_cpu = jax.default_backend() == "cpu"
+    tiles = -(-camera.width // config.tile_size) * -(-camera.height // config.tile_size)
+    chunk = 64 if 6 * count > 32 * tiles else 16
+    limit = config.slots or 2 ** (17 if on_cpu else 21) // config.bands
+    return BlendConfig(
+        width=camera.width,
+        height=camera.height,
+        tile=config.tile_size,
+        chunk=config.chunk or chunk,
+        slots=slots_of(count, tiles, config.capacity, limit),
+        capacity=config.capacity,
+        tiles_at_once=config.tiles_at_once or (1 if on_cpu else 2048),
+        by_products=not on_cpu,
+        bands=bands_of(camera, config),
+        alpha_min=config.alpha_min,
+        alpha_max=config.alpha_max,
+        transmittance_min=config.transmittance_min,
+        near=config.near or 0.0,  # 0 orders every depth that occurs
+        surface=surface,
+    )
 
 
 def slots_of(count: int, tiles: int, capacity: int | None, limit: int) -> int:

@@ -13,9 +13,10 @@ from jaxtyping import Array, Float, Int, Integer
 
 from pigjax.core.arrays import matmul
 from pigjax.core.camera import Camera
-from pigjax.splat import RenderConfig, Splats, blend_config, project_splats
-from pigjax.splatting.binning import BlendConfig, front_to_back
+from pigjax.splatting.binning import BlendConfig, blend_config, front_to_back
+from pigjax.splatting.projection import project_splats
 from pigjax.splatting.scan_compositor import Chunks, all_chunks, walk
+from pigjax.splatting.types import RenderConfig, Splats
 
 _LEAST_PRESENCE = 1e-6  # below it a pixel has no surface; keeps its square within float32
 _DEPTH = -1  # column of the chunk's rows that holds camera z

@@ -26,13 +26,14 @@ from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.checks import suggest
 from pigjax.core.errors import InputError, SceneError
-from pigjax.coupling.particles import Binding, at_frame, deform
-from pigjax.mls_mpm import SimConfig, first_substeps, rollout, stable_dt
+from pigjax.coupling.binding import Binding, at_frame, deform
+from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, Health, Particles, Trajectory, fit_grid, vast_grid
 from pigjax.mpm.active_grid import box_for
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.materials import Material, MaterialTable, Parameters
+from pigjax.mpm.timestep import first_substeps, stable_dt
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, render_config, segment
 from pigjax.scene.schema import Scene
 from pigjax.splat import Gaussians, RenderConfig, Splats, render

@@ -1,0 +1,23 @@
+"""The Gaussians of a trained scene, which files hold and every stage reads."""
+
+from __future__ import annotations
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from pigjax.core.arrays import array_field
+
+SH_CONSTANT = 0.28209479177387814  # the spherical harmonic of degree 0, 1 / (2 √π)
+
+
+class Gaussians(eqx.Module):
+    """Trainable 3D Gaussians, parametrised as in 3DGS."""
+
+    means: Float[Array, "n 3"] = array_field()  # [m]
+    log_scales: Float[Array, "n 3"] = array_field()  # log of standard deviations in m
+    quats: Float[Array, "n 4"] = array_field()  # wxyz, any length; zero means no rotation
+    logit_opacities: Float[Array, "n"] = array_field()
+    sh: Float[Array, "n k 3"] = array_field()  # spherical harmonics, k = (degree + 1)²
+
+    def __len__(self) -> int:
+        return self.means.shape[0]

@@ -1,0 +1,63 @@
+"""Posed photos of one scene with their masks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from pigjax.core.camera import Camera
+from pigjax.core.errors import InputError
+
+
+class Views(eqx.Module):
+    """Posed photos of one scene, all of one size.
+
+    Pictures and masks stay in host memory as NumPy arrays until someone computes with them.
+    """
+
+    cameras: Camera  # batch of t
+    names: tuple[str, ...] = eqx.field(static=True)  # file names without suffix; with it or folders if they repeat
+    images: Float[np.ndarray | Array, "t h w 3"]  # RGB in 0..1
+    masks: Int[np.ndarray | Array, "t h w"] | None  # object ids
+    splits: tuple[str, ...] = eqx.field(static=True)  # "train", "test", ...
+    points_path: Path | None = eqx.field(static=True, default=None)  # sparse cloud for `load_points`
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> Views:
+        """The chosen views, in that order; one index gives `Views` of length 1."""
+        chosen = np.atleast_1d(np.arange(len(self))[index])
+        return Views(
+            cameras=self.cameras[chosen],
+            names=tuple(self.names[i] for i in chosen),
+            images=self.images[chosen],
+            masks=None if self.masks is None else self.masks[chosen],
+            splits=tuple(self.splits[i] for i in chosen),
+            points_path=self.points_path,
+        )
+
+    def subset(self, split: str) -> Views:
+        """Views of one split.
+
+        Raises:
+            InputError: no view belongs to it.
+        """
+        return self[of_split(self.splits, split, "Views")]
+
+
+def of_split(splits: Sequence[str], split: str, where: str) -> list[int]:
+    """Numbers of the views of a split.
+
+    Raises:
+        InputError: no view is of that split; it names those that there are.
+    """
+    found = [i for i, name in enumerate(splits) if name == split]
+    if not found:
+        counts = ", ".join(f"{name} ({splits.count(name)})" for name in sorted(set(splits)))
+        raise InputError(f"{where}: no views in split {split!r}; choose one of {counts}.")
+    return found

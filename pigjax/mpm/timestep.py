@@ -1,0 +1,237 @@
+"""Stable steps: the longest by the CFL bound, the integrator, and the substeps of a frame (host)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from pigjax.core.arguments import checked
+from pigjax.core.arrays import is_known
+from pigjax.core.errors import InputError
+from pigjax.mpm import Grid, Particles, SimConfig, fit_grid
+from pigjax.mpm.active_grid import LARGEST
+from pigjax.mpm.colliders import Collider
+from pigjax.mpm.materials import MaterialTable
+
+_COST_OF_IMPLICIT = 400  # explicit steps in the time of an implicit one, by benchmarks/bench_implicit.py
+_MOST_SUBSTEPS = 2.0**31
+Vector = Float[Array, "3"] | Sequence[float | int] | np.ndarray
+
+
+@checked
+def stable_dt(
+    table: MaterialTable,
+    grid: Grid,
+    *,
+    max_speed: Float[Array, ""] | float,
+    cfl: float = 0.4,
+    integrator: str = "explicit",
+) -> Float[Array, ""]:
+    """Longest stable step [s] of matter that moves at up to max_speed [m/s].
+
+    No wave of the stiffest law crosses more than `cfl` cells, nor does viscous momentum diffuse too far for the grid.
+    Implicit steps only must not carry a particle over more than `cfl` cells.
+
+    Raises:
+        InputError: the integrator is neither "explicit" nor "implicit".
+    """
+    if integrator not in ("explicit", "implicit"):
+        raise InputError(
+            f"integrator = {integrator!r}: stable_dt knows 'explicit' and 'implicit'; choose_integrator decides 'auto'."
+        )
+    if integrator == "implicit":
+        return cfl * grid.dx / jnp.maximum(max_speed, jnp.finfo(grid.dx.dtype).tiny)
+    advective = grid.dx / (table.wave_speed.max() + max_speed)
+    viscous = grid.dx**2 / (4 * (table.explicit_viscosity / table.density).max())  # infinite without viscosity
+    return cfl * jnp.minimum(advective, viscous)
+
+
+@checked
+def choose_integrator(
+    particles: Particles, grid: Grid, table: MaterialTable, config: SimConfig, **steps: Any
+) -> SimConfig:
+    """The settings with integrator "auto" decided (host): implicit where it saves more steps than one of its costs.
+
+    `steps` are the other arguments of `choose_substeps`.
+    """
+    if config.integrator != "auto":
+        return config
+    explicit, implicit = (replace(config, integrator=name) for name in ("explicit", "implicit"))
+    needed = [choose_substeps(particles, grid, table, choice, **steps) for choice in (explicit, implicit)]
+    return implicit if needed[0] > _COST_OF_IMPLICIT * needed[1] else explicit
+
+
+@checked
+def choose_substeps(
+    particles: Particles,
+    grid: Grid,
+    table: MaterialTable,
+    config: SimConfig,
+    *,
+    frames: int,
+    frame_dt: Float[Array, ""] | float,
+    gravity: Vector,
+    colliders: tuple[Collider, ...] = (),
+) -> int:
+    """Substeps per frame that keep a rollout stable (host).
+
+    The speed that falling can reach, by time or by the size of the grid, counts beside the present one. The number is
+    rounded up by at most an eighth, so that similar scenes share one compilation. It serves every frame of a rollout;
+    in a domain without walls (`vast_grid`) `rollout` begins with fewer, see `first_substeps`.
+
+    Raises:
+        InputError: a number is out of range, or no step is stable.
+    """
+    check_steps(frames, frame_dt, gravity)
+    if config.integrator == "auto":
+        steps: dict[str, Any] = {"frames": frames, "frame_dt": frame_dt, "gravity": gravity, "colliders": colliders}
+        config = choose_integrator(particles, grid, table, config, **steps)
+    duration = float(frame_dt)
+    time = frames * duration
+    needed = _substeps_needed(particles, grid, table, config, duration, gravity, colliders, fall=time, until=time)
+    unit = 2 ** max(needed.bit_length() - 4, 0)
+    return max(-(-needed // unit) * unit, 1)
+
+
+def first_substeps(
+    particles: Particles,
+    grid: Grid,
+    table: MaterialTable,
+    config: SimConfig,
+    **steps: Any,
+) -> tuple[SimConfig, int]:
+    """Settings with the integrator decided, and the substeps per frame that a simulation begins with (host).
+
+    In a domain without walls within reach only time bounds how far matter falls, and few scenes fall for all of it. So
+    they begin with what a fall through the particles' own extent needs, and `frame_substeps` takes more where the speed
+    asks for them. `steps` are the other arguments of `choose_substeps`.
+    """
+    near = _near(particles, grid) if is_open(grid) else grid
+    config = choose_integrator(particles, near, table, config, **steps)
+    return config, choose_substeps(particles, near, table, config, **steps)
+
+
+def frame_substeps(
+    first: int,
+    particles: Particles,
+    grid: Grid,
+    table: MaterialTable,
+    config: SimConfig,
+    *,
+    frame: int,
+    frame_dt: float,
+    gravity: Vector,
+    colliders: tuple[Collider, ...] = (),
+) -> int:
+    """Substeps of one frame, numbered from 0, by the speeds at its beginning (host).
+
+    It is `first`, or where that is too few the next of `first` times 1.5, 2, 3, 4, 6, ..., so that a long fall costs
+    few compilations. The state at the beginning of the frame decides alone: a simulation that goes on from there
+    chooses the same.
+    """
+    until = (frame + 1) * frame_dt
+    needed = _substeps_needed(particles, grid, table, config, frame_dt, gravity, colliders, fall=frame_dt, until=until)
+    ladder = (size << k for k in range(64) for size in (2 * first, 3 * first))
+    return next(-(-size // 2) for size in ladder if size >= 2 * needed)
+
+
+def _substeps_needed(particles, grid, table, config, frame_dt, gravity, colliders, *, fall, until):
+    """The fewest stable ones where matter may fall for a while [s] and colliders move until a time [s]."""
+    pull = float(np.linalg.norm(gravity))
+    height = float(grid.dx) * math.hypot(*grid.shape)
+    speed = _max_speed(particles, colliders, grid, until, way=lambda v: v * fall + pull * fall**2 / 2)
+    speed = min(speed + pull * fall, math.sqrt(speed**2 + 2 * pull * height))
+    limit = float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl, integrator=config.integrator))
+    needed = frame_dt / limit * (1 - 1e-6) if limit > 0 else math.inf
+    if not needed < _MOST_SUBSTEPS:
+        raise InputError(
+            f"a frame of {frame_dt:.3g} s would need {needed:.2g} substeps at {speed:.3g} m/s and a stable limit of"
+            f" {limit:.3g} s (at most {_MOST_SUBSTEPS:.2g}): take slower or softer matter, or shorter frames."
+        )
+    return math.ceil(needed)
+
+
+def is_open(grid):
+    """Whether the grid is so large that its walls are out of reach."""
+    return math.prod(grid.shape) > LARGEST
+
+
+def _near(particles, grid):
+    """The grid around the particles where they are; the given one if no particle is finite."""
+    x = np.asarray(particles.x)
+    return fit_grid(x, float(grid.dx)) if np.isfinite(x).all(1).any() else grid
+
+
+def _max_speed(particles, colliders, grid, until, way):
+    """Of particles now and of colliders until a time [s]; `way` tells how far matter gets [m] by its speed [m/s]."""
+    fastest = float(_fastest(particles.v))
+    moving = [collider for collider in colliders if collider.moves]
+    if not moving:
+        return fastest
+    near, units = (_near(particles, grid) if is_open(grid) else grid), np.array(list(np.ndindex(2, 2, 2)))
+    corners = np.asarray(near.origin) + float(near.dx) * units * (np.array(near.shape) - 1)
+    for _ in range(2 if is_open(grid) else 1):  # what a collider hits goes on as fast, and so gets farther
+        reached = corners + (2 * units - 1) * (way(fastest) if is_open(grid) else 0.0)
+        points = jnp.asarray(reached, particles.x.dtype)
+        fastest = max([fastest, *(float(collider.top_speed(points, until)) for collider in moving)])
+    return fastest
+
+
+@jax.jit
+def _fastest(v):
+    """Speed of the fastest particle whose speed is finite; the square of a large one would not be."""
+    speeds = jnp.hypot(jnp.hypot(v[:, 0], v[:, 1]), v[:, 2])
+    return jnp.max(speeds, where=jnp.isfinite(speeds), initial=0.0)
+
+
+def check_steps(frames: Any, frame_dt: Any, gravity: Any) -> None:
+    """Refuse a number of frames, a time between them [s] or a gravity [m/s²] that no rollout takes (InputError)."""
+    if isinstance(frames, bool) or not isinstance(frames, int | np.integer) or frames < 1:
+        raise InputError(f"frames = {frames}: must be a whole number, 1 or more.")
+    check_gravity(gravity)
+    if not is_known(frame_dt):
+        return
+    frame_dt = float(frame_dt)  # known also where jit closes over it, which a comparison of JAX's would not be
+    if not (math.isfinite(frame_dt) and frame_dt >= 0):
+        raise InputError(f"frame_dt = {frame_dt}: the time between frames must be >= 0 s, and finite.")
+
+
+def check_gravity(gravity: Any) -> None:
+    """Refuse a gravity that has not three finite components [m/s²] (InputError)."""
+    if np.shape(gravity) != (3,):
+        raise InputError(f"gravity has shape {np.shape(gravity)}: it must have three components [m/s²].")
+    if not is_known(gravity):
+        return
+    if not np.isfinite(np.asarray(gravity)).all():
+        raise InputError(f"gravity = {gravity}: its components must be finite [m/s²].")
+
+
+def longest_step(dt, particles, grid, table, config, colliders):
+    """The stable limit [s], with room for rounding, and the speed that it holds for [m/s]."""
+    speed = _max_speed(particles, colliders, grid, dt, way=lambda v: v * dt)
+    limit = float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl, integrator=config.integrator))
+    return limit * (1 + 1e-5), speed
+
+
+def check_dt(
+    dt: float,
+    particles: Particles,
+    grid: Grid,
+    table: MaterialTable,
+    config: SimConfig,
+    colliders: tuple[Collider, ...],
+) -> None:
+    """Refuse a step [s] above the stable limit, unless `config.force` (InputError)."""
+    limit, speed = longest_step(dt, particles, grid, table, config, colliders)
+    if dt > limit and not config.force:
+        raise InputError(
+            f"dt = {dt:.4g} s is above the stable limit of {limit:.4g} s at cfl {config.cfl:g} and {speed:.3g} m/s:"
+            " take more substeps, or set SimConfig(force=True)."
+        )
