@@ -89,7 +89,7 @@ def main():
         intro = [
             "# Verification",
             f"Written by `{COMMAND}` from what it printed on {machine()}. CPU seconds are of a whole case,"
-            " compilation and all. `pytest tests/test_verification.py -s -n0` holds the"
+            " compilation and all. `pytest tests/benchmarks/test_verification.py -s -n0` holds the"
             " cheapest form of each case.",
             "\n".join([*head, *rows]),
         ]

@@ -1,7 +1,8 @@
 """Votes against a float64 brute force, their edges, their soft limit and its gradients, and object masks."""
 
+from __future__ import annotations
+
 import dataclasses
-import functools
 from pathlib import Path
 
 import jax
@@ -9,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from dense import dense_render
+from facing import ONES, facing_camera, lift, opaque
 
-from pigjax.core.camera import Camera, look_at, stack_cameras
+from pigjax.core.camera import look_at, stack_cameras
 from pigjax.core.errors import InputError
 from pigjax.io import load_views
 from pigjax.objects.overlay import id_colours, id_image, legend_sheet, overlay
@@ -134,24 +136,6 @@ def test_ties_without_credit_go_to_the_lowest_id():
     labels = lift_masks(gaussians_of(scene), cameras, masks, num_ids=NUM_IDS, ties="lowest")
     votes, credits = brute_force(scene, cameras, masks)
     np.testing.assert_array_equal(labels.object_id, elect(votes, 0 * credits, background="ignore"))
-
-
-def facing_camera(size=16, focal=16.0):
-    """A camera at the origin looking along z, with numbers that are exact in binary."""
-    return Camera(np.eye(4)[None], np.full((1, 2), focal), np.full((1, 2), size / 2), size, size)
-
-
-def opaque(means, scale=0.2, opacity_logit=6.0):
-    means = np.asarray(means, float)
-    n = len(means)
-    return Gaussians(
-        means, np.full((n, 3), np.log(scale)), np.tile([1.0, 0, 0, 0], (n, 1)), np.full(n, opacity_logit),
-        np.zeros((n, 1, 3)),
-    )  # fmt: skip
-
-
-ONES = np.ones((1, 16, 16), np.int32)
-lift = functools.partial(lift_masks, ties="lowest")  # spares these small scenes the compilation of the second pass
 
 
 def test_a_depth_exactly_on_the_tolerance_votes():

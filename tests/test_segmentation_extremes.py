@@ -6,7 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_segmentation import ONES, facing_camera, lift, opaque
+from facing import (
+    ONES,
+    facing_camera,
+    lift,
+    opaque,
+)
 
 from pigjax.core.camera import Camera, look_at, stack_cameras
 from pigjax.core.errors import InputError

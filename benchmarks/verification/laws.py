@@ -63,7 +63,7 @@ def laws():
 
     Momenta; free fall against symplectic Euler's closed form; a rigid turn by 0.8 rad, where the strain may be that of
     the centripetal force. And two columns that bear their weight, as means over whole periods: an elastic one on a
-    sticky floor, a fluid one of 16 cells between slip walls. tests/test_mls_mpm.py holds more of them.
+    sticky floor, a fluid one of 16 cells between slip walls. tests/mpm/test_mls_mpm.py holds more of them.
     """
     rows = []
     for kernel in ("quadratic", "cubic"):

@@ -21,7 +21,7 @@ from pigjax.study.optimize import load_table, sweep
 from pigjax.study.optimize import sweep as sweep_function
 from pigjax.study.optimize.table import Table
 
-WORKER = Path(__file__).parent / "sweep_worker.py"
+WORKER = Path(__file__).parents[1] / "helpers/sweep_worker.py"
 GRID = {"a": np.linspace(-1.0, 2.0, 5), "b": [0.5, 1.0, 4.0]}
 
 

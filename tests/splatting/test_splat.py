@@ -1,5 +1,7 @@
 """The renderer against a dense float64 compositor, gsplat's own numbers, and central differences."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from dense import dense_render
+from splats import dense, gaussians_of, make_scene
 
 import pigjax.splat as splat_module
-from pigjax.core.camera import Camera, look_at
+from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
 from pigjax.splat import Gaussians, RenderConfig, render, required_capacity, surface_depth
 from pigjax.splatting.alpha import blend_chunk, running_sums, transmittances
@@ -21,39 +23,6 @@ from pigjax.splatting.types import OUTPUTS
 
 EXACT = RenderConfig(alpha_min=1e-7, transmittance_min=0.0)
 DEFAULT = RenderConfig()
-
-
-def make_scene(count=60, seed=0, width=40, height=28, degree=3, spread=1.0):
-    rng = np.random.default_rng(seed)
-    scene = {
-        "means": rng.normal(0, 0.5 * spread, (count, 3)),
-        "quats": rng.normal(size=(count, 4)),
-        "scales": np.exp(rng.normal(np.log(0.08), 0.6, (count, 3))),
-        "opacities": rng.uniform(0.05, 0.98, count),
-        "sh": rng.normal(0, 0.2, (count, (degree + 1) ** 2, 3)),
-    }
-    camera = look_at(np.array([1.2, -2.0, 1.0]), np.zeros(3), focal=45.0, width=width, height=height)
-    camera = Camera(camera.world_to_cam, camera.focal * np.array([1.0, 1.1]), camera.centre + 1.3, width, height)
-    return scene, camera
-
-
-def gaussians_of(scene):
-    logit = np.log(scene["opacities"] / (1 - scene["opacities"]))
-    return Gaussians(scene["means"], np.log(scene["scales"]), scene["quats"], logit, scene["sh"])
-
-
-def dense(scene, camera, config, **kwargs):
-    values = [np.asarray(v, np.float64) for v in (camera.world_to_cam, camera.focal, camera.centre)]
-    return dense_render(
-        **scene,
-        view=values[0],
-        focal=values[1],
-        centre=values[2],
-        width=camera.width,
-        height=camera.height,
-        config=config,
-        **kwargs,
-    )
 
 
 @pytest.mark.parametrize(("degree", "antialias"), [(0, False), (1, True), (2, False), (3, True)])
@@ -105,7 +74,7 @@ def test_error_of_the_default_thresholds_is_small_and_printed(x64):
 
 @pytest.fixture(scope="module")
 def gsplat_reference():
-    data = dict(np.load(Path(__file__).parent / "data" / "gsplat_reference.npz"))
+    data = dict(np.load(Path(__file__).parents[1] / "data" / "gsplat_reference.npz"))
     k = data["in_K"]
     logit = np.log(data["in_opacities"] / (1 - data["in_opacities"]))
     gaussians = Gaussians(data["in_means"], np.log(data["in_scales"]), data["in_quats"], logit, data["in_sh"])

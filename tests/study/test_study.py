@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 import tomli_w
-from test_scene import ball
+from scenes import ball
 from typer.testing import CliRunner
 
 from pigjax import io
@@ -26,7 +26,7 @@ from pigjax.study import Voting, experiment, load_study, sweep_study, tune_study
 from pigjax.study.objectives import pyramid_error, video
 from pigjax.study.optimize import load_table
 
-STUDIES = Path(__file__).parents[1] / "examples" / "studies"
+STUDIES = Path(__file__).parents[2] / "examples" / "studies"
 SCENE = {
     "input": {"gaussians": "cloud.ply"},
     "simulation": {"dx": 0.08, "frames": 3, "fps": 30.0, "particles_per_cell": 4},

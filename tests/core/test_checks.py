@@ -12,7 +12,7 @@ import pytest
 import tomli_w
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_scene import ball
+from scenes import ball
 
 from pigjax import io
 from pigjax.core.camera import look_at, stack_cameras
@@ -126,7 +126,7 @@ def test_any_value_of_any_study_field_is_legal_or_one_line_that_names_it(path, v
 
 
 def test_any_value_of_any_setting_is_legal_or_refused_by_name():
-    script = Path(__file__).parent / "any_config_value.py"
+    script = Path(__file__).parents[1] / "helpers/any_config_value.py"
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr[-2000:]
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rounding import assert_same
-from test_scene import ball, values
+from scenes import ball, values
 
 from pigjax import io
 from pigjax.core.errors import InputError, SceneError

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_splat import dense, gaussians_of, make_scene
+from splats import dense, gaussians_of, make_scene
 
 from pigjax import InputError, contributions, prune, render, stack_cameras
 from pigjax.splat import RenderConfig

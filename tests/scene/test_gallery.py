@@ -9,7 +9,7 @@ from pigjax import io
 from pigjax.mpm.materials import PRESETS
 from pigjax.scene import load_scene
 
-FOLDER = Path(__file__).parents[1] / "examples" / "materials"
+FOLDER = Path(__file__).parents[2] / "examples" / "materials"
 SCENES = {path.stem: path for path in FOLDER.glob("*.toml")}
 NOT_SHOWN = {"stationary": "does not move"}
 

@@ -54,7 +54,7 @@ def test_a_cloud_filled_with_gaussians_keeps_its_volume(count):
 
 def test_strays_within_a_reconstructed_shell_do_not_make_it_a_filled_cloud():
     # the bundled scene's duck: of the 47 voxels deep within its shell, 13 hold splats that no view could forbid
-    data = np.load(Path(__file__).parent / "data/tabletop_duck.npz")
+    data = np.load(Path(__file__).parents[1] / "data/tabletop_duck.npz")
     duck = Gaussians(**data, sh=np.zeros((len(data["means"]), 1, 3)))
     box_of_centres = np.prod(np.ptp(data["means"], axis=0))
     assert 0.25 * box_of_centres < solid_of(shell_of(duck)).volume < 0.5 * box_of_centres

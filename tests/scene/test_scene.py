@@ -1,5 +1,7 @@
 """Scene files: every bad one gives one clear line; a whole small scene runs, resumes and is drawn anew."""
 
+from __future__ import annotations
+
 import json
 import shutil
 import subprocess
@@ -13,33 +15,16 @@ import msgspec
 import numpy as np
 import pytest
 from rounding import assert_same
+from scenes import ball, values
 from typer.testing import CliRunner
 
 from pigjax import io
-from pigjax.cli import app
+from pigjax.cli import app, segmenting
 from pigjax.core.errors import InputError, MissingFileError, SceneError, SimulationError
-from pigjax.scene import load_scene, objects, plan, run_scene, scene_from
+from pigjax.scene import load_scene, plan, run_scene, scene_from
 from pigjax.segmentation import Labels
-from pigjax.splat import Gaussians
 
-EXAMPLE = Path(__file__).parents[1] / "examples" / "tabletop" / "scene.toml"
-
-
-def values(**changes):
-    base = {
-        "input": {"gaussians": "cloud.ply"},
-        "simulation": {"dx": 0.05, "frames": 3, "fps": 30.0, "particles_per_cell": 4},
-        "objects": {"ball": {"id": 1, "material": "jelly", "young": 2000.0}},
-        "planes": {"floor": {"point": [0, 0, 0], "normal": [0, 0, 1]}},
-        "camera": {"width": 48, "height": 40, "target": [0, 0, 0.3], "radius": 2.0},
-    }
-    for key, value in changes.items():
-        section, _, name = key.partition("__")
-        base.setdefault(section, {})
-        base[section] = value if not name else {**base[section], name: value}
-    return base
-
-
+EXAMPLE = Path(__file__).parents[2] / "examples" / "tabletop" / "scene.toml"
 BAD = {
     "unknown field": (values(simulation__frame=3), r"simulation\.frame: unknown field; did you mean 'frames'"),
     "unknown section": (values(simulatoin={}), r"simulatoin: unknown field; did you mean 'simulation'"),
@@ -145,17 +130,6 @@ def test_a_scene_places_and_moves_every_kind_of_collider():
     assert (capsule.mode, drum.mode, float(capsule.friction), float(drum.friction)) == (
         "slip", "sticky", 0.5, pytest.approx(0.1),
     )  # fmt: skip
-
-
-def ball(count=400, seed=0):
-    rng = np.random.default_rng(seed)
-    direction = rng.normal(size=(count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    points = 0.2 * direction + [0, 0, 0.3]
-    quats = np.tile([1.0, 0, 0, 0], (count, 1))
-    sh = rng.uniform(-1, 1, (count, 1, 3))
-    parts = points, np.full((count, 3), np.log(0.02)), quats, np.full(count, 3.0), sh
-    return Gaussians(*(jnp.asarray(v, jnp.float32) for v in parts))
 
 
 @pytest.fixture(scope="module")
@@ -296,11 +270,11 @@ def test_report_and_scene_round_trip_as_plain_values(finished):
 def test_info_says_what_files_hold(folder):
     said = CliRunner().invoke(app, ["info", str(folder / "cloud.ply")])
     assert said.exit_code == 0
-    described = objects.describe_file(folder / "cloud.ply")
+    described = segmenting.describe_file(folder / "cloud.ply")
     assert described["Gaussians"] == "400"
     assert described["SH degree"] == "0"
-    assert "duck (jelly)" in objects.describe_file(EXAMPLE)["moving"]
-    assert objects.describe_file(EXAMPLE.parent)["views"].startswith("40, ")
+    assert "duck (jelly)" in segmenting.describe_file(EXAMPLE)["moving"]
+    assert segmenting.describe_file(EXAMPLE.parent)["views"].startswith("40, ")
 
 
 @pytest.mark.parametrize("command", [[], ["demo"], ["run"], ["reconstruct"], ["segment"], ["info"]])

@@ -13,7 +13,7 @@ from pigjax.core.camera import project
 from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io import load_cameras, load_points, load_views
 
-TABLETOP = Path(__file__).parents[1] / "examples" / "tabletop"
+TABLETOP = Path(__file__).parents[2] / "examples" / "tabletop"
 
 # A camera at (1, 2, 3) that looks along world -y with world z up: x right is world -x, y down is world -z.
 CAM_TO_WORLD_OPENCV = np.array([[-1, 0, 0, 1], [0, 0, -1, 2], [0, -1, 0, 3], [0, 0, 0, 1.0]])

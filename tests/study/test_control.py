@@ -11,7 +11,7 @@ import pytest
 from pigjax.study import load_study
 from pigjax.study.objectives import objective_of
 
-STUDIES = Path(__file__).parents[1] / "examples" / "studies"
+STUDIES = Path(__file__).parents[2] / "examples" / "studies"
 
 
 @pytest.fixture(scope="module")

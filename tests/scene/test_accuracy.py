@@ -21,7 +21,7 @@ from pigjax.scene.accuracy import LEVELS
 from pigjax.scene.plan import make_cameras, provenance, read_inputs, render_config
 from pigjax.splat import RenderConfig
 
-EXAMPLE = Path(__file__).parents[1] / "examples/tabletop/scene.toml"
+EXAMPLE = Path(__file__).parents[2] / "examples/tabletop/scene.toml"
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tomli_w
-from test_evaluation import FAR, NEAR, write_folder
-from test_evaluation import scene as walls
-from test_scene import ball
+from scenes import ball
 from typer.testing import CliRunner
+from walls import FAR, NEAR, write_folder
+from walls import scene as walls
 
 from pigjax import io
 from pigjax.cli import app

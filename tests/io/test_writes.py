@@ -18,16 +18,17 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from pigjax import cli, io
+from pigjax.cli import segmenting
 from pigjax.core.camera import look_at, stack_cameras
 from pigjax.core.errors import InputError
 from pigjax.objects.overlay import comparison_sheet, legend_sheet
-from pigjax.scene import load_scene, objects, run_scene
+from pigjax.scene import load_scene, run_scene
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians
 from pigjax.study.optimize.history import History
 from pigjax.study.optimize.table import Table, load_table
 
-TABLETOP = Path(__file__).parents[1] / "examples" / "tabletop"
+TABLETOP = Path(__file__).parents[2] / "examples" / "tabletop"
 STUDY = TABLETOP.parent / "studies" / "young_sweep.toml"
 QUICK = settings(
     max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
@@ -72,32 +73,32 @@ def test_different_names_become_different_files(names):
 
 
 @pytest.fixture
-def segmenting(monkeypatch):
+def segment_two(monkeypatch):
     """`segment_files` of two Gaussians with what it draws left out."""
     gaussians = Gaussians(*(jnp.zeros(s) for s in ((2, 3), (2, 3), (2, 4), (2,), (2, 1, 3))))
     gaussians = eqx.tree_at(lambda g: g.quats, gaussians, jnp.ones((2, 4)))
     labels = Labels(jnp.array([1, 2]), jnp.ones((2, 3)), jnp.ones(2))
     black = np.zeros((4, 4, 3), np.float32)
-    monkeypatch.setattr(objects, "lift", lambda *a, **k: labels)
-    monkeypatch.setattr(objects, "contributions", lambda *a: np.ones(2))
-    monkeypatch.setattr(objects, "hole_mask", lambda *a, **k: np.ones((4, 4), bool))
-    monkeypatch.setattr(objects, "render", lambda *a, **k: type("Frame", (), {"rgb": black}))
-    monkeypatch.setattr(objects, "_sheet", lambda *a: black)
+    monkeypatch.setattr(segmenting, "lift", lambda *a, **k: labels)
+    monkeypatch.setattr(segmenting, "contributions", lambda *a: np.ones(2))
+    monkeypatch.setattr(segmenting, "hole_mask", lambda *a, **k: np.ones((4, 4), bool))
+    monkeypatch.setattr(segmenting, "render", lambda *a, **k: type("Frame", (), {"rgb": black}))
+    monkeypatch.setattr(segmenting, "_sheet", lambda *a: black)
     camera = look_at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0), focal=4.0, width=4, height=4)
     two = stack_cameras([camera, camera])
 
     def segment(out, names, views=("a", "b")):
         photos = io.Views(two, tuple(views), np.stack([black, black]), np.ones((2, 4, 4), np.int32), ("train",) * 2)
-        return objects.segment_files(gaussians, photos, names, out, fill=False, remove=["1"])
+        return segmenting.segment_files(gaussians, photos, names, out, fill=False, remove=["1"])
 
     return segment
 
 
 @settings(QUICK, max_examples=15)
 @given(name=NAMES, other=NAMES, view=NAMES)
-def test_names_never_leave_the_output_folder(segmenting, tmp_path_factory, name, other, view):
+def test_names_never_leave_the_output_folder(segment_two, tmp_path_factory, name, other, view):
     home = tmp_path_factory.mktemp("home")
-    segmenting(home / "deep" / "out", {1: name, 2: other}, views=(view, "b"))
+    segment_two(home / "deep" / "out", {1: name, 2: other}, views=(view, "b"))
     out = home / "deep" / "out"
     written = {path for path in home.rglob("*") if path.is_file()}
     assert all(path.parent in (out, out / "objects", out / "removed", *(out / "removed").iterdir()) for path in written)
@@ -105,10 +106,10 @@ def test_names_never_leave_the_output_folder(segmenting, tmp_path_factory, name,
     assert len(list((out / "removed").glob("001*/*.png"))) == 2
 
 
-def test_a_victim_beside_the_output_folder_is_untouched(segmenting, tmp_path):
+def test_a_victim_beside_the_output_folder_is_untouched(segment_two, tmp_path):
     (tmp_path / "victim").mkdir()
     (tmp_path / "victim" / "mine.ply").write_text("mine")
-    segmenting(tmp_path / "out", {1: "a/../../../victim/mine", 2: "red/blue cup"})
+    segment_two(tmp_path / "out", {1: "a/../../../victim/mine", 2: "red/blue cup"})
     assert (tmp_path / "victim" / "mine.ply").read_text() == "mine"
     assert (tmp_path / "out" / "objects" / "002_red_blue_cup.ply").is_file()
 
@@ -127,7 +128,7 @@ def test_names_are_printed_literally(monkeypatch, tmp_path, name):
     io.write_json(tmp_path / "names.json", {"1": name})
     monkeypatch.setattr(io, "load_gaussians", lambda path, **k: None)
     monkeypatch.setattr(io, "load_views", lambda path, **k: None)
-    monkeypatch.setattr(objects, "segment_files", lambda *a, **k: {1: 7})
+    monkeypatch.setattr(segmenting, "segment_files", lambda *a, **k: {1: 7})
     arguments = ["segment", "a.ply", "views", "--names", str(tmp_path / "names.json"), "-o", str(tmp_path)]
     said = CliRunner().invoke(cli.app, arguments, catch_exceptions=False, env={"COLUMNS": "120"})
     assert said.exit_code == 0
@@ -324,7 +325,7 @@ with io.writing(out / "states/000013.npz") as state, io.writing(out / "video.mp4
 
 def killed(code, *arguments, signals, cwd=None, after=0.0):
     """Start Python, send it signals once it says "ready", and give its exit code and standard error."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])}
     process = subprocess.Popen(
         [sys.executable, "-c", "import signal; signal.signal(2, signal.default_int_handler)\n" + code, *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=cwd,
@@ -363,13 +364,13 @@ STOP_A_COMMAND = """
 import sys, time
 from pigjax import cli
 from pigjax import io
-from pigjax.scene import objects
+from pigjax.cli import segmenting
 def slow(path):
     with io.writing(path) as partial:
         partial.write_text("half")
         print("ready", flush=True)
         time.sleep(100)
-objects.describe_file = slow
+segmenting.describe_file = slow
 sys.argv = ["pigjax", "info", sys.argv[1]]
 cli.main()
 """
@@ -396,7 +397,7 @@ def test_errors_of_the_system_are_one_line(command, monkeypatch):
     def fail(path):
         raise OSError(errno.EIO, os.strerror(errno.EIO), "some.ply")
 
-    monkeypatch.setattr(objects, "describe_file", fail)
+    monkeypatch.setattr(segmenting, "describe_file", fail)
     code, said = command("info", "some.ply")
     assert code == 2
     assert said.startswith("error: some.ply: Input/output error; check the path")

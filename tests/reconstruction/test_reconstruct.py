@@ -212,7 +212,7 @@ def test_pose_refinement_takes_back_a_shifted_camera(views):
     assert after < 0.5 * before
 
 
-TABLETOP = Path(__file__).parents[1] / "examples" / "tabletop"
+TABLETOP = Path(__file__).parents[2] / "examples" / "tabletop"
 
 
 def as_inria(views, folder):
