@@ -71,8 +71,9 @@ def sweep_study(
     if jax.process_index() == 0:
         table.save(out / "table.csv")
         table.save(out / "table.npz")
+        best = table.best(study.sweep.of, mode=study.sweep.best)  # tells why, where no row is good
         _draw(study, table, out / "sweep.png")
-        _leave_best(study, table.best(study.sweep.of, mode=study.sweep.best), out)
+        _leave_best(study, best, out)
     return table
 
 
