@@ -1,4 +1,4 @@
-"""The clamp's ablation: `python benchmarks/bench_ablation.py [bent pressed drawn] [--write docs/ABLATION.md]`.
+"""The clamp's ablation: `python benchmarks/bench_ablation.py [bent pressed drawn] [--write docs/results/ABLATION.md]`.
 
 The modes of `eigen_clamp` on three objects that deform little, much and extremely, beside a truth made of many small
 parts (`ablation.reference`); then sweeps of lambda_R × lambda_S and of tau_max × tau_min for "aligned". `--write`
@@ -86,7 +86,7 @@ def study(subject: Subject, pixels: int, media: Path | None) -> str:
     lines += ["", *sweeps(subject, case, media)]
     if media:
         write_row(media / f"ablation_{subject.name}.png", images)
-        lines += ["", f"![reference and modes](media/ablation_{subject.name}.png)"]
+        lines += ["", f"![reference and modes](../media/ablation_{subject.name}.png)"]
     return "\n".join(lines)
 
 
@@ -155,7 +155,7 @@ def sweeps(subject: Subject, case: Case, media: Path | None) -> list[str]:
             (LAMBDAS, np.reshape(by_lambda["psnr"], (9, 9)), (r[best], s[best])),
             (TAU_MAX, TAU_MIN, np.reshape(by_tau["lambdas of 1"]["psnr"], (7, 7))),
         )
-        lines += ["", f"![sweeps](media/ablation_{subject.name}_sweep.png)"]
+        lines += ["", f"![sweeps](../media/ablation_{subject.name}_sweep.png)"]
     return lines
 
 

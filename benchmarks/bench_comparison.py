@@ -1,4 +1,4 @@
-"""The paper's comparison, re-made: `python benchmarks/bench_comparison.py [--write docs/COMPARISON.md]`.
+"""The paper's comparison, re-made: `python benchmarks/bench_comparison.py [--write docs/results/COMPARISON.md]`.
 
 Every method moves the bundled tabletop's cloud with known ids: E = 1e7 Pa and ν = 0.2 for all objects, the duck at
 (2, 0, 0) m/s, the mug at (1, -1, 0) m/s, the others at rest, the table fixed. `--only` names methods by a part of
@@ -51,7 +51,7 @@ def main():
         command = f"`python benchmarks/bench_comparison.py {settings}`, {machine()}"
         page = options.write.read_text() if options.write.exists() else "# Comparison\n"
         text = "\n".join(lines)
-        picture = f"![one row of frames per method](media/{PICTURE})"
+        picture = f"![one row of frames per method](../media/{PICTURE})"
         options.write.write_text(replaced(page, TITLE, f"{command}\n\n{text}\n\n{picture}"))
 
 

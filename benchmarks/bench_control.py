@@ -1,8 +1,8 @@
 """Control through contact: python benchmarks/bench_control.py [throw miss cost]
 
 The throw of a ball is sought that knocks a cube off the table (examples/studies/knock_off.toml), by the gradients of
-MLS-MPM through the contact on the grid, and without gradients. `--write docs/CONTROL.md` replaces the sections that
-were run.
+MLS-MPM through the contact on the grid, and without gradients. `--write docs/results/CONTROL.md` replaces the
+sections that were run.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def throw() -> None:
     print(f"\nLoss {history.loss[0]:.3g} to {history.least:.2g} m² in {len(history)} gradients.")
     frames = [frame for frames in rows for frame in frames[1::2]]
     io.write_image(MEDIA / "control_throw.png", io.contact_sheet(frames, columns=len(frames) // 2))
-    print("\n![Above the start, below what was found, every second frame](media/control_throw.png)")
+    print("\n![Above the start, below what was found, every second frame](../media/control_throw.png)")
 
 
 def miss() -> None:

@@ -1,7 +1,7 @@
 """System identification from video: python benchmarks/bench_identification.py [one two field other cost video]
 
 A known simulation of the tabletop is drawn, then stiffness and throw are recovered from the video alone, through the
-gradients of render ∘ clamp ∘ MLS-MPM. `--write docs/IDENTIFICATION.md` replaces the sections that were run.
+gradients of render ∘ clamp ∘ MLS-MPM. `--write docs/results/IDENTIFICATION.md` replaces the sections that were run.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def one() -> None:
     rows = [np.asarray(film(arrays(values), made))[::2] for values in (DUCK, DUCK_START, best)]
     sheet = io.contact_sheet([frame for row in rows for frame in row], columns=len(rows[0]))
     io.write_image(MEDIA / "identification_frames.png", sheet)
-    print("\n![Truth, start and what was found, every second frame](media/identification_frames.png)")
+    print("\n![Truth, start and what was found, every second frame](../media/identification_frames.png)")
 
 
 TWO = {

@@ -1,4 +1,4 @@
-"""Segmentation: error beside time. `python benchmarks/bench_segmentation.py [part ...] [--write docs/SEGMENTATION.md]`.
+"""Error of segmentation: `python benchmarks/bench_segmentation.py [part ...] [--write docs/results/SEGMENTATION.md]`.
 
 Parts: votes, trained, comparison, association, noise, sweep, memory; without names all are run. `--write` replaces the
 sections of those parts in the page, and their plots in docs/media. The cloud with known ids and the views are bundled;
@@ -23,7 +23,7 @@ def compare(scene, _):
     bundled = load_ply(EXAMPLE / "tabletop.ply")
     on_trained = comparison.study(bundled, scene.train, scene.test, scene.names, MEDIA)
     on_cloud = comparison.study(scene.gaussians, scene.train, scene.test, scene.names, None, truth=scene.truth)
-    picture = "![truth, ours, rivals](media/segmentation_baselines.png)"
+    picture = "![truth, ours, rivals](../media/segmentation_baselines.png)"
     return f"Trained scene:\n\n{on_trained}\n\n{picture}\n\nCloud with known ids:\n\n{on_cloud}"
 
 
@@ -37,11 +37,11 @@ STUDIES = {
     ),
     "noise": (
         "Noisy masks",
-        lambda scene, _: noise.study(scene, MEDIA) + f"\n\n![accuracy against noise](media/{noise.PLOT})",
+        lambda scene, _: noise.study(scene, MEDIA) + f"\n\n![accuracy against noise](../media/{noise.PLOT})",
     ),
     "sweep": (
         "Thresholds, views, resolution",
-        lambda scene, _: sweep.study(scene, MEDIA) + f"\n\n![thresholds, views and resolution](media/{sweep.PLOT})",
+        lambda scene, _: sweep.study(scene, MEDIA) + f"\n\n![thresholds, views and resolution](../media/{sweep.PLOT})",
     ),
     "memory": ("Memory of a large vote", lambda *_: f"{memory.HEADER}\n{memory.study()}"),
 }

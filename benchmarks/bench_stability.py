@@ -1,4 +1,4 @@
-"""MLS-MPM at its extremes: `python benchmarks/bench_stability.py [--laws ...] [--write docs/STABILITY.md]`.
+"""MLS-MPM at its extremes: `python benchmarks/bench_stability.py [--laws ...] [--write docs/results/STABILITY.md]`.
 
 One program per law (125 particles of two materials, 200 steps) meets every extreme. Tables: what each extreme ends in,
 how far steps may exceed the stable one, error against time over the length of steps, and what is refused.

@@ -1,4 +1,4 @@
-"""Speed against accuracy: `python benchmarks/bench_tradeoff.py [part ...] [--write docs/TRADEOFF.md]`.
+"""Speed against accuracy: `python benchmarks/bench_tradeoff.py [part ...] [--write docs/results/TRADEOFF.md]`.
 
 Parts: matter, drawing, voting, whole; without names all are run. Each knob is turned alone from the standard, on the
 bundled tabletop, a jelly cube and a cube of sand (`--scenes`). Times are medians of warm runs in turn, compilation

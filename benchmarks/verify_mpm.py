@@ -1,6 +1,6 @@
 """MLS-MPM against closed forms and experiments: `python benchmarks/verify_mpm.py [case ...] [--plots docs/media]`.
 
-One line per figure. Without names every case runs, and docs/VERIFICATION.md is written from what was printed.
+One line per figure. Without names every case runs, and docs/results/VERIFICATION.md is written from what was printed.
 """
 
 import argparse
@@ -67,7 +67,7 @@ def run(name, folder):
     text = inspect.cleandoc(CASES[name].__doc__)
     section = [f"## {name.replace('_', ' ')}", f"`{COMMAND} {name}`", text]
     if plot is not None:
-        section.append(f"![{name}]({plot.relative_to(DOCS) if plot.is_relative_to(DOCS) else plot})")
+        section.append(f"![{name}]({'..' / plot.relative_to(DOCS) if plot.is_relative_to(DOCS) else plot})")
     return lines, "\n\n".join(section)
 
 
@@ -93,7 +93,7 @@ def main():
             " cheapest form of each case.",
             "\n".join([*head, *rows]),
         ]
-        (DOCS / "VERIFICATION.md").write_text("\n\n".join([*intro, *(text for _, text in sections)]) + "\n")
+        (DOCS / "results" / "VERIFICATION.md").write_text("\n\n".join([*intro, *(text for _, text in sections)]) + "\n")
 
 
 if __name__ == "__main__":

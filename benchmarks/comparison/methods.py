@@ -32,7 +32,7 @@ from pigjax.splatting.types import as_splats
 from .setting import DENSITY, FRICTION, GRAVITY, TABLE, VELOCITIES, YOUNG, Setting, subset
 
 CHOICE_EVERY = 4  # training views that choose thresholds
-TRAINING_STEPS = 100  # of features: most Gaussians are right then, see docs/SEGMENTATION.md
+TRAINING_STEPS = 100  # of features: most Gaussians are right then, see docs/results/SEGMENTATION.md
 DRIVERS = 2000  # particles that drive, of all objects together
 ANCHORS = 2048  # as in Spring-Gaus
 

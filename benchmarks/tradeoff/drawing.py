@@ -41,7 +41,7 @@ def study(folder: Path, scenes) -> str:
         "One picture of the deformed scene. Reference: the exact setting (alpha ≥ 1e-6, no early stop) in float64. Of a"
         " smaller picture the error is that of the picture enlarged."
     )
-    return "\n\n".join([head, *text, f"![error against time of drawing](media/{PLOT})"])
+    return "\n\n".join([head, *text, f"![error against time of drawing](../media/{PLOT})"])
 
 
 def _study(name):

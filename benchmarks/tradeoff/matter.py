@@ -44,7 +44,7 @@ def study(folder: Path, scenes) -> str:
         panels[name], floors[name], said = _study(name)
         print(f"**{name}**\n\n{said}\n\n{table(panels[name], error='error of the distance travelled')}\n")
     plot(panels, folder / PLOT, error="displacement error (share of the distance)", floors=floors)
-    return f"![error against time of matter](media/{PLOT})"
+    return f"![error against time of matter](../media/{PLOT})"
 
 
 def _study(name):

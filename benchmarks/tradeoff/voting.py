@@ -47,7 +47,7 @@ def study(folder: Path, scenes) -> str:
         " scenes have one object each, so nothing to vote on."
     )
     return "\n\n".join(
-        [head, table(points, error="share wrong", show="{:.4f}".format), f"![error against time](media/{PLOT})"]
+        [head, table(points, error="share wrong", show="{:.4f}".format), f"![error against time](../media/{PLOT})"]
     )
 
 

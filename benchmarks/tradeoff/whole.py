@@ -31,7 +31,7 @@ def study(folder: Path, scenes) -> str:
         panels[name], floors[name], said = _study(name)
         print(f"**{name}**\n\n{said}\n\n{table(panels[name], error='RMS error of colour')}\n")
     plot(panels, folder / PLOT, error="RMS error of colour in the video", floors=floors)
-    return f"![error against time of the whole pipeline](media/{PLOT})"
+    return f"![error against time of the whole pipeline](../media/{PLOT})"
 
 
 def _study(name):
