@@ -19,9 +19,9 @@ class FieldComments(Extension):
 
     def on_class(self, *, cls: Any, **kwargs: Any) -> None:
         """Called by Griffe for a class whose members are known."""
-        lines = cls.lines_collection[cls.filepath]
+        lines = cls.lines_collection[cls.filepath] if cls.filepath in cls.lines_collection else []
         for field in cls.attributes.values():
-            if field.docstring is None and field.lineno:
+            if field.docstring is None and 0 < (field.lineno or 0) <= len(lines):  # builtins have no source
                 text = comment_of(lines, field.lineno, field.endlineno or field.lineno)
                 field.docstring = Docstring(text, parent=field) if text else None
 
