@@ -19,7 +19,8 @@ class FieldComments(Extension):
 
     def on_class(self, *, cls: Any, **kwargs: Any) -> None:
         """Called by Griffe for a class whose members are known."""
-        lines = cls.lines_collection[cls.filepath] if cls.filepath in cls.lines_collection else []
+        known = cls.filepath in cls.lines_collection
+        lines = cls.lines_collection[cls.filepath] if known else []
         for field in cls.attributes.values():
             if field.docstring is None and 0 < (field.lineno or 0) <= len(lines):  # builtins have no source
                 text = comment_of(lines, field.lineno, field.endlineno or field.lineno)

@@ -25,7 +25,7 @@ Mask = Bool[Array, "... _ _"] | Num[Array, "... _ _"] | Bool[np.ndarray, "... _ 
 
 @checked
 def psnr(a: Float[Array, "h w *c"], b: Float[Array, "h w *c"]) -> Float[Array, ""]:
-    """Peak signal-to-noise ratio [dB] of images in [0, 1]; inf where they are equal.
+    """Peak signal-to-noise ratio [dB] of images `a` and `b` in [0, 1]; inf where they are equal.
 
     Raises:
         InputError: the images differ in shape, or hold integers.
@@ -37,7 +37,7 @@ def psnr(a: Float[Array, "h w *c"], b: Float[Array, "h w *c"]) -> Float[Array, "
 @checked
 @jax.jit
 def ssim(a: Float[Array, "h w *c"], b: Float[Array, "h w *c"]) -> Float[Array, ""]:
-    """Structural similarity of images in [0, 1], mean over pixels and channels (Wang et al. 2004).
+    """Structural similarity of images `a` and `b` in [0, 1], mean over pixels and channels (Wang et al. 2004).
 
     As in 3DGS: Gaussian window 11x11 with σ = 1.5 px, zeros beyond the edge. Reverse mode only.
 
@@ -113,6 +113,11 @@ def boundary_iou(prediction: Mask, truth: Mask, dilation_ratio: float = 0.02) ->
 
     A boundary is the mask minus its erosion by a 3x3 element, d times with zeros beyond the edge, where d is
     `dilation_ratio` of the image's diagonal, rounded, and at least 1 px.
+
+    Args:
+        prediction: masks [... h w], as `mean_iou` takes them.
+        truth: masks [... h w].
+        dilation_ratio: width of a boundary as a share of the diagonal; 0.02 is the published value.
     """
     truth = _binary(truth)
     height, width = truth.shape[-2:]

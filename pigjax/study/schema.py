@@ -227,10 +227,14 @@ def _put(values: dict[str, Any], name: str, value: Any) -> None:
 
 @checked
 def load_study(path: str | Path, *, method: str | None = None) -> Study:
-    """Read and check a study file; `method`, if given, is that of `tune`. Host.
+    """Read and check a study file. Host.
 
     A study whose objective is a function of a Python file runs that file: where it lies outside the working folder, a
     warning says so.
+
+    Args:
+        path: the file (.toml).
+        method: "adam" or "cma", instead of the file's `tune.method`.
 
     Raises:
         MissingFileError: there is no such file.
