@@ -87,7 +87,7 @@ def _blur_along(images: Float[Array, "*n h w"], axis: int) -> Float[Array, "*n h
     window = np.exp(-(offsets**2) / (2 * _SIGMA**2))
     margins = [(0, 0)] * images.ndim
     margins[axis] = (_RADIUS, _RADIUS)
-    # without the barrier XLA:CPU computes the padded image anew for each of the eleven slices
+    # without the barrier XLA:CPU recomputes the padded image for each of the eleven slices
     padded = lax.optimization_barrier(jnp.pad(images, margins))
     size = images.shape[axis]
     weights = window / window.sum()
@@ -144,7 +144,7 @@ def _iou(a: Bool[Array, "*v h w"], b: Bool[Array, "*v h w"]) -> Float[Array, "*v
 
 
 def _erode(mask: Bool[Array, "*v h w"], distance: int) -> Bool[Array, "*v h w"]:
-    """Where the square window of this radius is full, counted in a summed-area table: the cost knows no radius."""
+    """Where the square window of this radius is full, by a summed-area table: the cost does not depend on the radius."""
     size = 2 * distance + 1
     for axis in (mask.ndim - 2, mask.ndim - 1):
         margins = [(0, 0)] * mask.ndim
@@ -174,7 +174,7 @@ def score_masks(
     """mIoU and mBIoU by the protocol of Gaussian Grouping, host.
 
     Args:
-        predictions: masks [h w] by (view, prompt); what is missing scores 0, what has no truth is left out.
+        predictions: masks [h w] by (view, prompt); a missing prediction scores 0, one without truth is left out.
         truths: masks [h w] by (view, prompt).
         dilation_ratio: width of the boundary as a share of the image's diagonal.
 

@@ -188,7 +188,7 @@ class ColliderSpec(Section, frozen=True, kw_only=True):
     velocity: Annotated[Triple, _SPEED] | None = None
     angular_velocity: Annotated[Triple, Limits(-1e6, 1e6, unit="rad/s")] | None = None
     rotation: Annotated[tuple[float, float, float, float], _WEIGHT] | None = None  # quaternion wxyz
-    pivot: Annotated[Triple, _PLACE] | None = None  # what it turns about; None: its middle
+    pivot: Annotated[Triple, _PLACE] | None = None  # centre of its rotation; None: its middle
     shape: ClassVar[type[Collider]]
 
     def to_collider(self, where: str) -> Collider:
@@ -261,7 +261,7 @@ class Scene(Section, frozen=True):
     spheres: dict[str, SphereSpec] = field(default_factory=dict)  # colliders by name
     capsules: dict[str, CapsuleSpec] = field(default_factory=dict)  # colliders by name
     cylinders: dict[str, CylinderSpec] = field(default_factory=dict)  # colliders by name
-    folder: str = "."  # set by `load_scene`; what relative paths start from
+    folder: str = "."  # set by `load_scene`; the base of relative paths
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """Something moves, and each id belongs to one object."""

@@ -1,4 +1,4 @@
-"""A scene as a pure function of named parameters: what studies vary, simulate, draw and score.
+"""A scene as a pure function of named parameters: varied, simulated, drawn and scored by studies.
 
 Parameters have the names of the scene file's fields: "objects.duck.young", "objects.duck.velocity", "clamp.lambda_R",
 "simulation.gravity", "planes.ground.friction". A scene file is read once; from there all is arrays, so that an
@@ -280,7 +280,7 @@ def experiment(
 
 
 def _only_named(inputs: Inputs, plan: Plan) -> tuple[Inputs, Plan]:
-    """Without the Gaussians of other objects; what is left is counted anew."""
+    """Without the Gaussians of other objects; the rest is renumbered."""
     object_id = np.asarray(plan.labels.object_id)
     kept = np.isin(object_id, [0, *inputs.ids.values()])
     row = jnp.asarray(np.cumsum(kept) - 1)
