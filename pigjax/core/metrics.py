@@ -144,7 +144,7 @@ def _iou(a: Bool[Array, "*v h w"], b: Bool[Array, "*v h w"]) -> Float[Array, "*v
 
 
 def _erode(mask: Bool[Array, "*v h w"], distance: int) -> Bool[Array, "*v h w"]:
-    """Where the square window of this radius is full, by a summed-area table: the cost does not depend on the radius."""
+    """Where the square window of this radius is full; a summed-area table makes the cost independent of the radius."""
     size = 2 * distance + 1
     for axis in (mask.ndim - 2, mask.ndim - 1):
         margins = [(0, 0)] * mask.ndim
