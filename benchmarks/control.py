@@ -13,8 +13,8 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _pages import run_parts
-from _timing import measure, use_host_devices
+from benchmarks.common.pages import run_parts
+from benchmarks.common.timing import measure, use_host_devices
 
 from pigjax import io
 from pigjax.study import experiment, load_study

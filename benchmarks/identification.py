@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import msgspec
 import numpy as np
 import optax
-from _pages import run_parts
-from _timing import measure, use_host_devices
+from benchmarks.common.pages import run_parts
+from benchmarks.common.timing import measure, use_host_devices
 
 from pigjax import io
 from pigjax.study import Experiment, experiment, load_study

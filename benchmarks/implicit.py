@@ -13,7 +13,7 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _timing import machine
+from benchmarks.common.timing import machine
 
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, make_particles

@@ -20,9 +20,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _profile import seconds_by_scope
-from _timing import machine, use_host_devices
-from tradeoff.points import in_turn
+from benchmarks.common.scopes import seconds_by_scope
+from benchmarks.common.timing import machine, use_host_devices
+from benchmarks.tradeoff.points import in_turn
 
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, fit_grid, make_particles

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _timing import machine, measure
+from benchmarks.common.timing import machine, measure
 from jax import lax
 
 from pigjax import load_ply, load_views, prune, psnr, render

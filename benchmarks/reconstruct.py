@@ -6,7 +6,7 @@ import resource
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-from _timing import machine, use_host_devices
+from benchmarks.common.timing import machine, use_host_devices
 
 from pigjax import FitConfig, RenderConfig, load_points, load_views, reconstruct, save_ply
 

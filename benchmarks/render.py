@@ -18,7 +18,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _timing import machine, measure, use_host_devices
+from benchmarks.common.timing import machine, measure, use_host_devices
 from jax import lax
 
 from pigjax import Gaussians, RenderConfig, look_at, render, stack_cameras

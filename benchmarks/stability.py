@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _timing import machine
+from benchmarks.common.timing import machine
 
 from pigjax.core.errors import InputError, SimulationError
 from pigjax.mls_mpm import SimConfig, rollout

@@ -20,7 +20,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _timing import machine, use_host_devices
+from benchmarks.common.timing import machine, use_host_devices
 from jax.sharding import Mesh
 
 from pigjax import ClampParams, Material, SimConfig, load_scene, material_table, psnr, render, rollout, sweep

@@ -13,12 +13,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _pages import run_parts
-from _timing import measure
-from ablation.pictures import write_heat, write_row
-from ablation.reference import EXACT, render_parts, split
-from ablation.scenes import Subject, subjects
-from ablation.scores import ASPECT, GROWTH, SHARE, image_scores, needles
+from benchmarks.common.pages import run_parts
+from benchmarks.common.timing import measure
+from benchmarks.ablation.pictures import write_heat, write_row
+from benchmarks.ablation.reference import EXACT, render_parts, split
+from benchmarks.ablation.scenes import Subject, subjects
+from benchmarks.ablation.scores import ASPECT, GROWTH, SHARE, image_scores, needles
 
 import pigjax as pj
 from pigjax.splatting.types import as_splats

@@ -9,7 +9,7 @@ from pigjax.core.camera import Camera
 from pigjax.io import Views
 from pigjax.splat import Gaussians
 
-from .training import draw
+from benchmarks.baselines.training import draw
 
 
 def choose(gaussians: Gaussians, candidates: np.ndarray, views: Views) -> tuple[np.ndarray, dict[int, int]]:

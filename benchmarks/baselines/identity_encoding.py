@@ -19,7 +19,7 @@ from pigjax.core.camera import Camera
 from pigjax.io import Views
 from pigjax.splat import Gaussians
 
-from .training import Fitted, draw, fit
+from benchmarks.baselines.training import Fitted, draw, fit
 
 WIDTH = 16
 FEATURE_RATE, CLASSIFIER_RATE = 2.5e-2, 5e-3  # of Adam at the start

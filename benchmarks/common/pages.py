@@ -1,17 +1,42 @@
-"""Benchmarks whose parts print tables, and pages in docs/ that hold what they printed."""
+"""Pages of docs/results and their pictures: where they lie, Markdown of tables, and sections that are replaced."""
 
-import argparse
 import contextlib
 import io
+import os
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-from _timing import machine
+ROOT = Path(__file__).parents[2]
+PAGES, MEDIA = ROOT / "docs" / "results", ROOT / "docs" / "media"
+EXAMPLES = ROOT / "examples"
+TABLETOP = EXAMPLES / "tabletop"
+
+
+def row(*cells: Any) -> str:
+    """A line of a table."""
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def head(*columns: Any) -> str:
+    """The first two lines of a table."""
+    return f"{row(*columns)}\n{'|---' * len(columns)}|"
+
+
+def table(columns: list[str], rows: list[list[str]]) -> str:
+    """A whole table."""
+    return "\n".join([head(*columns), *(row(*cells) for cells in rows)])
+
+
+def picture(name: str, told: str) -> str:
+    """A line of a page that shows a file of docs/media."""
+    return f"![{told}]({Path(os.path.relpath(MEDIA / name, PAGES)).as_posix()})"
 
 
 def replaced(page: str, title: str, text: str) -> str:
-    """The page with the tables of a section replaced; what stands before the section's first table or line stays."""
+    """The page with the printed part of a section replaced; prose before it stays, a new section comes last."""
     begin, end = f"<!-- {title}: printed -->", f"<!-- {title}: end -->"
     section = f"{begin}\n\n{text}\n\n{end}"
     pattern = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
@@ -20,46 +45,28 @@ def replaced(page: str, title: str, text: str) -> str:
     return f"{page.rstrip()}\n\n## {title}\n\n{section}\n"
 
 
+def write_section(path: Path, heading: str, title: str, text: str) -> None:
+    """Replace a section of a page; `heading` is that of a page that is not there yet."""
+    page = path.read_text() if path.exists() else f"# {heading}\n"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(replaced(page, title, text.strip()))
+
+
 class _Tee(io.StringIO):
-    """Keeps what is printed, and shows it at once."""
+    """Keeps the text, and shows it at once."""
+
+    def __init__(self):
+        super().__init__()
+        self._shown = sys.stdout
 
     def write(self, text: str) -> int:
-        sys.__stdout__.write(text)
-        sys.__stdout__.flush()
+        self._shown.write(text)
+        self._shown.flush()
         return super().write(text)
 
 
-def run_parts(script: str, heading: str, parts: dict, description: str, **arguments: dict) -> None:
-    """Run the parts named on the command line; `--write PAGE` replaces their sections there.
-
-    Args:
-        script: name of the benchmark, for the command that the page tells.
-        heading: of a page that is not there yet.
-        parts: title and function by name; it prints its tables, or gives their text.
-        description: for --help.
-        arguments: further options of the command line, as `add_argument` takes them; with any, the functions are given
-            all that was chosen.
-    """
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", metavar="part", help=", ".join(parts))
-    parser.add_argument("--write", type=Path, help="page whose sections are replaced")
-    for name, settings in arguments.items():
-        parser.add_argument(f"--{name}", **settings)
-    options = parser.parse_args()
-    other = [f" --{name} {_shown(getattr(options, name))}" for name in arguments
-             if getattr(options, name) != parser.get_default(name)]  # fmt: skip
-    for name in options.parts or parts:
-        title, study = parts[name]
-        kept = _Tee()
-        print(f"\n## {title}\n")
-        with contextlib.redirect_stdout(kept):
-            print(f"`python benchmarks/{script} {name}{''.join(other)}`, {machine()}\n")
-            if text := study(options) if arguments else study():
-                print(text)
-        if options.write:
-            page = options.write.read_text() if options.write.exists() else f"# {heading}\n"
-            options.write.write_text(replaced(page, title, kept.getvalue().strip()))
-
-
-def _shown(value) -> str:
-    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+@contextlib.contextmanager
+def kept() -> Iterator[io.StringIO]:
+    """Inside, what is printed is shown and kept."""
+    with contextlib.redirect_stdout(_Tee()) as text:
+        yield text

@@ -11,11 +11,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from baselines import mass_spring
-from baselines.feature_distillation import select_by_similarity, similarities, train_features
-from baselines.region_boxes import ids_in_boxes
-from baselines.rigid_topk import driving_points, follow, nearest_drivers
-from baselines.surface_only import ids_by_members
+from benchmarks.baselines import mass_spring
+from benchmarks.baselines.feature_distillation import select_by_similarity, similarities, train_features
+from benchmarks.baselines.region_boxes import ids_in_boxes
+from benchmarks.baselines.rigid_topk import driving_points, follow, nearest_drivers
+from benchmarks.baselines.surface_only import ids_by_members
 
 from pigjax.clamp import ClampParams
 from pigjax.coupling.binding import bind, deform
@@ -29,7 +29,7 @@ from pigjax.objects.lifting import lift
 from pigjax.splat import Splats
 from pigjax.splatting.types import as_splats
 
-from .setting import DENSITY, FRICTION, GRAVITY, TABLE, VELOCITIES, YOUNG, Setting, subset
+from benchmarks.comparison.setting import DENSITY, FRICTION, GRAVITY, TABLE, VELOCITIES, YOUNG, Setting, subset
 
 CHOICE_EVERY = 4  # training views that choose thresholds
 TRAINING_STEPS = 100  # of features: most Gaussians are right then, see docs/results/SEGMENTATION.md

@@ -11,12 +11,12 @@ import functools
 from pathlib import Path
 
 import numpy as np
-from _pages import replaced
-from _timing import machine
-from comparison.kept import kept
-from comparison.methods import all_methods
-from comparison.setting import make_setting
-from comparison.study import HEADER, Truth, draw_rows, pictures, row
+from benchmarks.common.pages import replaced
+from benchmarks.common.timing import machine
+from benchmarks.comparison.kept import kept
+from benchmarks.comparison.methods import all_methods
+from benchmarks.comparison.setting import make_setting
+from benchmarks.comparison.study import HEADER, Truth, draw_rows, pictures, row
 
 MEDIA = Path(__file__).parents[1] / "docs/media"
 TITLE, PICTURE = "Table", "comparison.jpg"

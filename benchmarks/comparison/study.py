@@ -7,9 +7,9 @@ import numpy as np
 from pigjax.splat import RenderConfig, render
 from pigjax.splatting.types import as_splats
 
-from . import scores
-from .methods import Motion
-from .setting import FINE, TABLE, Setting, camera, subset
+from benchmarks.comparison import scores
+from benchmarks.comparison.methods import Motion
+from benchmarks.comparison.setting import FINE, TABLE, Setting, camera, subset
 
 matplotlib.use("Agg")
 MOVED = 0.002  # [m]

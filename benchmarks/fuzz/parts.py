@@ -46,7 +46,7 @@ def fuzz(count, seed=0, readers=None, tell=print):
 
 
 def _jobs(count, names):
-    from _readers import READERS
+    from benchmarks.fuzz.readers import READERS
 
     chosen = {name: reader for name, reader in READERS.items() if names is None or name in names}
     total = sum(reader.share for reader in chosen.values())
@@ -113,7 +113,7 @@ def _read_all(listing, seed):
     def tell(**what):
         print(json.dumps(what), file=out, flush=True)
 
-    from _readers import READERS
+    from benchmarks.fuzz.readers import READERS
 
     warnings.simplefilter("ignore")
     jobs = json.loads(listing.read_text())
@@ -150,7 +150,7 @@ def _bound_memory():
 
 def _read_one(reader, folder, rng, others):
     """Damage a file of the folder, read, and put the file back."""
-    from _damage import damaged
+    from benchmarks.fuzz.damage import damaged
 
     from pigjax.core.errors import InputError
 
@@ -196,8 +196,8 @@ def _names_memory(error):
 
 def _again(which, seed, keep):
     """One input anew in this process, with its traceback; its files stay in the folder `keep`."""
-    from _damage import damaged
-    from _readers import READERS
+    from benchmarks.fuzz.damage import damaged
+    from benchmarks.fuzz.readers import READERS
 
     name, _, number = which.rpartition(":")
     keep.mkdir(parents=True)

@@ -8,7 +8,7 @@ from scipy.optimize import linear_sum_assignment
 
 from pigjax.objects.association import associate_masks
 from pigjax.segmentation import fill_unseen, lift_masks
-from segmentation.tabletop import Tabletop, mean_scores, scores_by_object
+from benchmarks.segmentation.tabletop import Tabletop, mean_scores, scores_by_object
 
 HEADER = """| masks | ids found | Gaussians right | of consistent masks | mIoU | mBIoU | of consistent mIoU | time [s] |
 |---|---|---|---|---|---|---|---|"""

@@ -9,17 +9,17 @@ import jax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
-from baselines.box_selection import select_by_box
-from baselines.feature_distillation import image_similarities, select_by_similarity, train_features
-from baselines.identity_encoding import encoded_ids, image_ids, train_encoding
-from baselines.training import Fitted
+from benchmarks.baselines.box_selection import select_by_box
+from benchmarks.baselines.feature_distillation import image_similarities, select_by_similarity, train_features
+from benchmarks.baselines.identity_encoding import encoded_ids, image_ids, train_encoding
+from benchmarks.baselines.training import Fitted
 
 from pigjax.core.metrics import score_masks
 from pigjax.io import Views
 from pigjax.segmentation import fill_unseen, lift_masks
 from pigjax.splat import Gaussians, render
 
-from .tabletop import TABLE, mean_scores, scores_by_object
+from benchmarks.segmentation.tabletop import TABLE, mean_scores, scores_by_object
 
 matplotlib.use("Agg")
 

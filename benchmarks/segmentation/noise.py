@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from pigjax.segmentation import Labels, fill_unseen, lift_masks
-from segmentation.tabletop import TABLE, Tabletop, mean_scores, scores_by_object
+from benchmarks.segmentation.tabletop import TABLE, Tabletop, mean_scores, scores_by_object
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -9,9 +9,9 @@ points.ids.npy), `--ply` reconstructions to score in part trained.
 from functools import cache
 from pathlib import Path
 
-from _pages import run_parts
-from segmentation import association, comparison, memory, noise, sweep, trained, votes
-from segmentation.tabletop import EXAMPLE, load_tabletop
+from benchmarks.common.pages import run_parts
+from benchmarks.segmentation import association, comparison, memory, noise, sweep, trained, votes
+from benchmarks.segmentation.tabletop import EXAMPLE, load_tabletop
 
 from pigjax.io import load_ply
 

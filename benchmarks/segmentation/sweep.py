@@ -15,7 +15,7 @@ from jax.scipy.special import logit
 
 from pigjax.segmentation import enough_capacity, lift_masks
 from pigjax.splat import RenderConfig
-from segmentation.tabletop import Tabletop
+from benchmarks.segmentation.tabletop import Tabletop
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

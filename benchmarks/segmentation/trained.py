@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pigjax.io import load_ply
 from pigjax.segmentation import fill_unseen, lift_masks
-from segmentation.tabletop import EXAMPLE, TABLE, Tabletop, mean_scores, scores_by_object
+from benchmarks.segmentation.tabletop import EXAMPLE, TABLE, Tabletop, mean_scores, scores_by_object
 
 CUT = {"weighting": "alpha", "background": "vote"}
 KINDS = {

@@ -9,7 +9,7 @@ from jax import lax
 
 from pigjax.segmentation import enough_capacity, fill_unseen, lift_masks
 from pigjax.splat import RenderConfig, surface_depth
-from segmentation.tabletop import Tabletop
+from benchmarks.segmentation.tabletop import Tabletop
 
 KINDS = {
     "paper's thresholds, ties by alpha·T": {},

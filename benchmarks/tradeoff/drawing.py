@@ -10,9 +10,9 @@ import numpy as np
 from pigjax import prune
 from pigjax.scene.plan import make_cameras
 from pigjax.splat import RenderConfig, required_capacity
-from tradeoff.errors import enlarged, root_mean_square, video_psnr
-from tradeoff.points import Point, in_turn, plot, table
-from tradeoff.scenes import as_float64, picture, pose, simulate, source
+from benchmarks.tradeoff.errors import enlarged, root_mean_square, video_psnr
+from benchmarks.tradeoff.points import Point, in_turn, plot, table
+from benchmarks.tradeoff.scenes import as_float64, picture, pose, simulate, source
 
 PLOT = "tradeoff_drawing.png"
 EXACT = {"alpha_min": 1e-6, "transmittance_min": 0.0}

@@ -7,9 +7,9 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from tradeoff.errors import displacement_error, distance_travelled
-from tradeoff.points import Point, in_turn, plot, table
-from tradeoff.scenes import as_float64, simulate, source, tracers
+from benchmarks.tradeoff.errors import displacement_error, distance_travelled
+from benchmarks.tradeoff.points import Point, in_turn, plot, table
+from benchmarks.tradeoff.scenes import as_float64, simulate, source, tracers
 
 PLOT = "tradeoff_matter.png"
 KNOBS = {

@@ -7,10 +7,10 @@ apart. `--write` replaces the sections of those parts in the page, and their plo
 
 from pathlib import Path
 
-from _pages import run_parts
-from _timing import use_host_devices
-from tradeoff import drawing, matter, voting, whole
-from tradeoff.scenes import SCENES
+from benchmarks.common.pages import run_parts
+from benchmarks.common.timing import use_host_devices
+from benchmarks.tradeoff import drawing, matter, voting, whole
+from benchmarks.tradeoff.scenes import SCENES
 
 MEDIA = Path(__file__).parents[1] / "docs/media"
 STUDIES = {"Matter": matter, "Drawing": drawing, "Voting": voting, "The whole pipeline": whole}

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from segmentation.tabletop import load_tabletop
+from benchmarks.segmentation.tabletop import load_tabletop
 
 from pigjax.segmentation import enough_capacity, lift_masks
 from pigjax.splat import RenderConfig
-from tradeoff.errors import share_right
-from tradeoff.points import Point, in_turn, plot, table
+from benchmarks.tradeoff.errors import share_right
+from benchmarks.tradeoff.points import Point, in_turn, plot, table
 
 PLOT = "tradeoff_voting.png"
 STANDARD = {"every": 1, "size": 256}

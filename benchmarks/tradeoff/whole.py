@@ -5,9 +5,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from tradeoff.errors import root_mean_square, video_psnr
-from tradeoff.points import Point, in_turn, plot, table
-from tradeoff.scenes import draw, simulate, source
+from benchmarks.tradeoff.errors import root_mean_square, video_psnr
+from benchmarks.tradeoff.points import Point, in_turn, plot, table
+from benchmarks.tradeoff.scenes import draw, simulate, source
 
 PLOT = "tradeoff_whole.png"
 LEVELS = ("draft", "standard", "reference")

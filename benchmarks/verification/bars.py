@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import curve_fit
 
 from pigjax.mls_mpm import SimConfig, rollout
-from verification.common import NO_GRAVITY, Case, Row, elastic, held, in_float64, nodes, order, particles, percent
+from benchmarks.verification.common import NO_GRAVITY, Case, Row, elastic, held, in_float64, nodes, order, particles, percent
 
 YOUNG, DENSITY = 1e4, 1000.0
 SPEED = math.sqrt(YOUNG / DENSITY)

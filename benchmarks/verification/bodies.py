@@ -13,7 +13,7 @@ from pigjax.mpm import Grid
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.timestep import stable_dt
-from verification.common import (
+from benchmarks.verification.common import (
     NO_GRAVITY,
     Case,
     Row,

@@ -20,10 +20,10 @@ from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import fit_grid, substep, transfers
 from pigjax.mpm.by_law import by_component
 from pigjax.mpm.transfers import stage
-from verification.bars import period
-from verification.common import NO_GRAVITY, Case, Row, elastic, in_float64, particles, percent
-from verification.kernels import KERNELS, energy_kept, ringing, turning
-from verification.manufactured import free_error
+from benchmarks.verification.bars import period
+from benchmarks.verification.common import NO_GRAVITY, Case, Row, elastic, in_float64, particles, percent
+from benchmarks.verification.kernels import KERNELS, energy_kept, ringing, turning
+from benchmarks.verification.manufactured import free_error
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import numpy as np
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.materials import Material, material_table
-from verification.common import Case, Row, elastic, held, lattice, nodes, particles, percent
+from benchmarks.verification.common import Case, Row, elastic, held, lattice, nodes, particles, percent
 
 GRAVITY = 9.81
 # Martin and Moyce 1952 (doi 10.1098/rsta.1952.0006), table 2: n² = 2, a = 2.25 in; T = t √(2 g / a), Z = front / a

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from pigjax.mls_mpm import SimConfig, rollout
-from verification.bars import SPEED, bar
-from verification.common import (
+from benchmarks.verification.bars import SPEED, bar
+from benchmarks.verification.common import (
     NO_GRAVITY,
     Case,
     Row,

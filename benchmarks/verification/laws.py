@@ -10,8 +10,8 @@ import numpy as np
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm.materials import Material, material_table
 from pigjax.mpm.materials.fluid import tait_pressure
-from verification.bars import bar
-from verification.common import (
+from benchmarks.verification.bars import bar
+from benchmarks.verification.common import (
     NO_GRAVITY,
     Case,
     Row,

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pigjax.mls_mpm import SimConfig, step
-from verification.common import NO_GRAVITY, Case, Row, elastic, held, in_float64, lattice, nodes, order, particles
+from benchmarks.verification.common import NO_GRAVITY, Case, Row, elastic, held, in_float64, lattice, nodes, order, particles
 
 
 def body_force(motion, m, X, t):

@@ -9,14 +9,14 @@ import time
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-from _timing import machine
-from verification.bars import bars
-from verification.bodies import cantilever, plates, two_discs
-from verification.classic import classic
-from verification.flows import dam_break, sand, sand_cylinder
-from verification.kernels import kernels
-from verification.laws import laws
-from verification.manufactured import axis_aligned, vortex
+from benchmarks.common.timing import machine
+from benchmarks.verification.bars import bars
+from benchmarks.verification.bodies import cantilever, plates, two_discs
+from benchmarks.verification.classic import classic
+from benchmarks.verification.flows import dam_break, sand, sand_cylinder
+from benchmarks.verification.kernels import kernels
+from benchmarks.verification.laws import laws
+from benchmarks.verification.manufactured import axis_aligned, vortex
 
 DOCS = Path(__file__).parents[1] / "docs"
 CASES = {

@@ -4,8 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from ablation.reference import EXACT, _components, _lattice, render_parts, split
-from ablation.scores import holes, needles
+from benchmarks.ablation.reference import EXACT, _components, _lattice, render_parts, split
+from benchmarks.ablation.scores import holes, needles
 
 import pigjax as pj
 from pigjax.core.camera import look_at

@@ -6,12 +6,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from verification.bars import period
-from verification.bodies import TOUCH, discs, modulus, parting, sag
-from verification.classic import classic_force
-from verification.flows import FRONT_T, FRONT_Z, column, friction_angle, front, lube
-from verification.kernels import energy_kept, ringing, turning
-from verification.manufactured import cube_error, free_error, vortex_error
+from benchmarks.verification.bars import period
+from benchmarks.verification.bodies import TOUCH, discs, modulus, parting, sag
+from benchmarks.verification.classic import classic_force
+from benchmarks.verification.flows import FRONT_T, FRONT_Z, column, friction_angle, front, lube
+from benchmarks.verification.kernels import energy_kept, ringing, turning
+from benchmarks.verification.manufactured import cube_error, free_error, vortex_error
 
 from pigjax.mls_mpm import SimConfig, step
 from pigjax.mpm import Grid, make_particles
