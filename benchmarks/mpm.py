@@ -1,18 +1,11 @@
-"""Speed, error and memory of MLS-MPM: `python benchmarks/bench_mpm.py [part ...] [--rivals PYTHON]`.
+"""Speed, error and memory of MLS-MPM, by law, size and feature.
 
-Parts: speed (ours on one and all devices, rivals beside), stages, laws, gradient, domain, features, sleep, batch,
-memory. Times are medians of warm windows, compile time apart; `--rounds 3` gives ours and the rivals their turn so many
-times, where neighbours disturb. `--rivals` is the Python of an environment with Taichi 1.7.4 and Warp 1.19, `--peers`
-the folder of their scripts. Without parts, all are run.
+`--rounds 3` gives ours and the rivals their turn so many times, where neighbours disturb. `--rivals` is the Python of
+an environment with Taichi 1.7.4 and Warp 1.19, `--peers` the folder of their scripts.
 """
 
-import argparse
 import json
-import os
-import resource
-import statistics
 import subprocess
-import time
 from functools import partial
 from pathlib import Path
 
@@ -20,17 +13,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmarks.common.scopes import seconds_by_scope
-from benchmarks.common.timing import machine, use_host_devices
-from benchmarks.tradeoff.points import in_turn
 
+from benchmarks.common.pages import ROOT, head, row
+from benchmarks.common.scopes import seconds_by_scope
+from benchmarks.common.timing import in_turn, peak_memory, timed
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, fit_grid, make_particles
-from pigjax.mpm.active_grid import Fit, whole
+from pigjax.mpm.active_grid import Fit
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.materials import LAWS, Material, material_table
-from pigjax.mpm.program import run_frames
 from pigjax.mpm.sleep import Sleep, Sleeper
 
 DT = 1e-4  # the rivals' step
@@ -43,8 +35,7 @@ NUMBERS = {
     "fibres": ELASTIC | {"fibre_stiffness": 1e5},
     "fluid": {"bulk_modulus": 1e5, "viscosity": 0.1},
 }
-CASES = ((10_000, 64), (100_000, 64), (100_000, 128), (500_000, 128))
-LARGE = ((4_000_000, 256),)  # for accelerators
+CASES = ((10_000, 64), (100_000, 64), (100_000, 128), (500_000, 128), (4_000_000, 256))  # particles, nodes a side
 DOWN = (0.0, 0.0, -9.8)
 
 
@@ -57,16 +48,10 @@ def scene(law, count, nodes, dtype=np.float32, domain=None):
     return particles, Grid(jnp.zeros(3, dtype), jnp.asarray(1 / nodes, dtype), (domain or nodes,) * 3), table
 
 
-def timed(run, *, windows=5):
-    """Seconds of the first call, and the median of warm ones."""
-    begun = time.perf_counter()
-    result = jax.block_until_ready(run())
-    first, times = time.perf_counter() - begun, []
-    for _ in range(windows):
-        begun = time.perf_counter()
-        jax.block_until_ready(run())
-        times.append(time.perf_counter() - begun)
-    return first, statistics.median(times), result
+def cases(options):
+    """Those of at most `--largest` particles; without it the one for accelerators is theirs alone."""
+    largest = options.largest or (500_000 if jax.default_backend() == "cpu" else 4_000_000)
+    return [case for case in CASES if case[0] <= largest]
 
 
 def ours(law, count, nodes, *, steps=40, domain=None, colliders=(), contact=None, **config):
@@ -82,58 +67,53 @@ def ours(law, count, nodes, *, steps=40, domain=None, colliders=(), contact=None
             contact=contact,
         )  # fmt: skip
 
-    first, seconds, (end, _, health) = timed(run)
-    return first - seconds, seconds / steps, end, health
+    found = timed(run, windows=5)
+    end, _, health = found.result
+    return found.compile_seconds, found.seconds / steps, end, health
 
 
-def rival(arguments, engine, *options):
-    """What a rival's script prints."""
-    script = Path(arguments.peers) / f"mpm_{engine}.py"
-    done = subprocess.run([arguments.rivals, script, *map(str, options)], capture_output=True, text=True, check=False)
+def rival(options, engine, *arguments):
+    """Numbers that a rival's script prints."""
+    script = options.peers / f"mpm_{engine}.py"
+    done = subprocess.run([options.rivals, script, *map(str, arguments)], capture_output=True, text=True, check=False)
     lines = [line for line in done.stdout.splitlines() if line.startswith("{")]
     return json.loads(lines[-1]) if lines else {}
 
 
-def speed(arguments):
+def speed(options):
     """M particle-updates/s beside rivals, and their ratio: medians of rounds in which all have their turn."""
-    print("| case | law | ours, 1 device | ours, all | Taichi best | Warp | ours / best rival | compile s | health |")
-    print("|---|---|---|---|---|---|---|---|---|")
-    for law in ("fixed_corotated", "neo_hookean"):
-        if law not in arguments.laws:
-            continue
-        for count, nodes in CASES if jax.default_backend() == "cpu" else CASES + LARGE:
+    print(head("case", "law", "ours, 1 device", "ours, all", "Taichi best", "Warp", "ours / best rival", "compile s",
+               "health"))  # fmt: skip
+    for law in options.laws:
+        for count, nodes in cases(options):
             compile_seconds, _, _, health = ours(law, count, nodes, devices=1)
-            rounds = np.array([rates(arguments, law, count, nodes) for _ in range(arguments.rounds)]) / 1e6
+            rounds = np.array([rates(options, law, count, nodes) for _ in range(options.rounds)]) / 1e6
             mine, best = rounds[:, :2].max(1), rounds[:, 2:].max(1)
             ratio = f"{np.median(mine / best):.2f}" if best.all() else "-"
-            columns = " | ".join(f"{rate:.2f}" for rate in np.median(rounds, 0))
-            print(
-                f"| {count // 1000}k/{nodes}³ | {law} | {columns} | {ratio} | {compile_seconds:.1f} |"
-                f" {'; '.join(health.problems()) or 'healthy'} |",
-                flush=True,
-            )
+            columns = [f"{rate:.2f}" for rate in np.median(rounds, 0)]
+            said = "; ".join(health.problems()) or "healthy"
+            print(row(f"{count // 1000}k/{nodes}³", law, *columns, ratio, f"{compile_seconds:.1f}", said))
 
 
-def rates(arguments, law, count, nodes):
-    """Particle-updates/s of ours on one and on all devices, of the best of Taichi's ways, and of Warp."""
+def rates(options, law, count, nodes):
+    """Particle-updates/s of ours on one and on all devices, of Taichi's best settings, and of Warp."""
     all_devices = jax.local_device_count()
     one = count / ours(law, count, nodes, devices=1)[1]
     mine = one, one if all_devices == 1 else count / ours(law, count, nodes, devices=all_devices)[1]
-    if not arguments.rivals:
+    model = {"fixed_corotated": "fcr", "neo_hookean": "nh"}.get(law)
+    if not options.rivals or model is None:
         return *mine, 0.0, 0.0
-    common = ["--particles", count, "--grid", nodes, "--substeps", 20, "--windows", 5]
-    common += ["--model", {"fixed_corotated": "fcr", "neo_hookean": "nh"}[law]]
-    ways = [["--threads", 1], ["--threads", all_devices]]
-    ways += [["--threads", 1, "--serialize", "--order", "sorted"]] if law == "neo_hookean" else []
-    taichi = [rival(arguments, "taichi", *common, *way).get("particle_updates_per_s", 0) for way in ways]
-    warp = rival(arguments, "warp", *common, "--threads", 1).get("particle_updates_per_s", 0)
+    common = ["--particles", count, "--grid", nodes, "--substeps", 20, "--windows", 5, "--model", model]
+    settings = [["--threads", 1], ["--threads", all_devices]]
+    settings += [["--threads", 1, "--serialize", "--order", "sorted"]] if law == "neo_hookean" else []
+    taichi = [rival(options, "taichi", *common, *setting).get("particle_updates_per_s", 0) for setting in settings]
+    warp = rival(options, "warp", *common, "--threads", 1).get("particle_updates_per_s", 0)
     return *mine, max(taichi), warp
 
 
-def laws(arguments):
-    """Every law on one device: time, and the error of positions after 20 steps against float64, relative to the way."""
-    print("| law, 20k/32³ | ns per particle and step | M updates/s | compile s | error to float64 |")
-    print("|---|---|---|---|---|")
+def laws(_):
+    """Every law on one device: time, and the error of displacements after 20 steps against float64."""
+    print(head("law, 20k/32³", "ns per particle and step", "M updates/s", "compile s", "error to float64"))
     for law in (name for name, law in LAWS.items() if law.respond is not None):
         count, nodes, steps = 20_000, 32, 20
         compile_seconds, seconds, end, _ = ours(law, count, nodes, steps=steps, devices=1)
@@ -141,10 +121,10 @@ def laws(arguments):
             particles, grid, table = scene(law, count, nodes, np.float64)
             settings = SimConfig(substeps=steps, devices=1)
             exact, _, _ = rollout(particles, grid, table, settings, frames=1, frame_dt=steps * DT, gravity=DOWN)
-            way = np.abs(exact.x - particles.x).max()
-            error = np.abs(np.asarray(end.x, np.float64) - np.asarray(exact.x)).max() / way
+            farthest = np.abs(exact.x - particles.x).max()
+            error = np.abs(np.asarray(end.x, np.float64) - np.asarray(exact.x)).max() / farthest
         each, rate = seconds / count * 1e9, count / seconds / 1e6
-        print(f"| {law} | {each:.0f} | {rate:.2f} | {compile_seconds:.1f} | {error:.1e} |", flush=True)
+        print(row(law, f"{each:.0f}", f"{rate:.2f}", f"{compile_seconds:.1f}", f"{error:.1e}"))
 
 
 STAGES = {
@@ -158,30 +138,42 @@ STAGES = {
 }
 
 
-def stages(arguments):
+def stages(options):
     """Where the time of a substep goes, one device: shares by the profiler, of the time without it."""
-    print(f"| ns per particle and substep | {' | '.join(STAGES.values())} | frame: sort, chunks | all |")
-    print("|---" * (len(STAGES) + 3) + "|")
+    print(head("ns per particle and substep", *STAGES.values(), "frame: sort, chunks", "all"))
     steps = 20
-    for law in arguments.laws:
-        for count, nodes in CASES:
-            particles, _, table = scene(law, count, nodes)
-            box = whole(fit_grid(particles.x, 1 / nodes, margin=2 / nodes))
-            settings, step = SimConfig(devices=1), {"frames": 1, "substeps": steps, "start": jnp.float32(0)}
-            step |= {"dt": jnp.float32(DT), "gravity": jnp.asarray(DOWN), "colliders": (), "contact": None}
-            compiled = run_frames.lower(particles, box, table, settings, 1, **step).compile().compiled
-            run = partial(run_frames, particles, box, table, settings, 1, **step)
-            _, seconds, _ = timed(run)
+    for law in options.laws:
+        for count, nodes in cases(options):
+            particles, compiled = compiled_frame(law, count, nodes, steps)
+            run = partial(compiled, particles)
+            seconds = timed(run, windows=5).seconds
             own = seconds_by_scope(compiled, run, STAGES)
-            scale = seconds / sum(own.values()) / count / steps * 1e9
-            cells = " | ".join(f"{scale * own[stage]:.0f}" for stage in (*STAGES, "rest"))
-            print(f"| {law} {count // 1000}k/{nodes}³ | {cells} | {seconds / count / steps * 1e9:.0f} |", flush=True)
+            each = 1e9 / count / steps
+            scale = seconds / sum(own.values()) * each
+            shares = [f"{scale * own[stage]:.0f}" for stage in (*STAGES, "rest")]
+            print(row(f"{law} {count // 1000}k/{nodes}³", *shares, f"{seconds * each:.0f}"))
 
 
-def gradient(arguments):
+def compiled_frame(law, count, nodes, steps, gradient=False):
+    """Particles, and the program of a frame of so many steps or of its gradient; one device."""
+    particles, _, table = scene(law, count, nodes)
+    grid = fit_grid(particles.x, 1 / nodes, margin=2 / nodes)
+    settings = SimConfig(substeps=steps, devices=1)
+
+    def frame(particles):
+        return rollout(particles, grid, table, settings, frames=1, frame_dt=steps * DT, gravity=DOWN)[0]
+
+    def height(x, particles):
+        return frame(eqx.tree_at(lambda p: p.x, particles, x)).x.sum()
+
+    if gradient:
+        return particles, jax.jit(jax.grad(height)).lower(particles.x, particles).compile()
+    return particles, jax.jit(frame).lower(particles).compile()
+
+
+def gradient(options):
     """Forward and backward through 8 and 32 steps at 10k/64³, neo-Hookean, one device, beside the rivals' tapes."""
-    print("| engine | steps | forward substeps/s | forward + backward substeps/s | in forwards | compile s |")
-    print("|---|---|---|---|---|---|")
+    print(head("engine", "steps", "forward substeps/s", "forward + backward substeps/s", "in forwards", "compile s"))
     particles, _, table = scene("neo_hookean", 10_000, 64)
     grid = fit_grid(particles.x, 1 / 64, margin=2 / 64)
     for steps in (8, 32):
@@ -192,35 +184,31 @@ def gradient(arguments):
             end, _, _ = rollout(moved, grid, table, settings, frames=1, frame_dt=steps * DT, gravity=DOWN)
             return end.x[:, 1].mean()
 
-        alone, both = jax.jit(height), jax.jit(jax.value_and_grad(height))
-        runs = {function: partial(function, particles.v, particles, table) for function in (alone, both)}
-        found = in_turn(runs, windows=21)
-        forward, seconds = found[alone].seconds, found[both].seconds
-        print(
-            f"| pigjax | {steps} | {steps / forward:.1f} | {steps / seconds:.1f} | {seconds / forward:.2f} |"
-            f" {found[both].compile_seconds:.1f} |",
-            flush=True,
-        )
-    for engine in ("taichi", "warp") if arguments.rivals else ():
-        options = ["--particles", 10_000, "--grid", 64, "--grad", "--substeps", 8, "--model", "nh", "--threads", 1]
-        told = rival(arguments, engine, *options)
-        rates = [told.get(name, 0) for name in ("fwd_substeps_per_s", "fwd_bwd_substeps_per_s")]
-        print(f"| {engine} | 8 | {rates[0]:.1f} | {rates[1]:.1f} | {told.get('ratio_fwdbwd_over_fwd', 0):.2f} | |")
+        functions = {"forward": jax.jit(height), "both": jax.jit(jax.value_and_grad(height))}
+        runs = {name: partial(function, particles.v, particles, table) for name, function in functions.items()}
+        forward, both = in_turn(runs, windows=21).values()
+        numbers = steps / forward.seconds, steps / both.seconds
+        print(row("pigjax", steps, *(f"{n:.1f}" for n in numbers), f"{both.over(forward):.2f}",
+                  f"{both.compile_seconds:.1f}"))  # fmt: skip
+    for engine in ("taichi", "warp") if options.rivals else ():
+        settings = ["--particles", 10_000, "--grid", 64, "--grad", "--substeps", 8, "--model", "nh", "--threads", 1]
+        told = rival(options, engine, *settings)
+        rates = [f"{told.get(name, 0):.1f}" for name in ("fwd_substeps_per_s", "fwd_bwd_substeps_per_s")]
+        print(row(engine, 8, *rates, f"{told.get('ratio_fwdbwd_over_fwd', 0):.2f}", ""))
 
 
-def domain(arguments):
+def domain(_):
     """The same object in domains of growing size."""
-    print("| domain, 100k particles at dx = 1/64 | ms per substep | against 64³ |")
-    print("|---|---|---|")
+    print(head("domain, 100k particles at dx = 1/64", "ms per substep", "against 64³"))
     base = None
     for sides in (64, 256, 1024):
         _, seconds, _, _ = ours("fixed_corotated", 100_000, 64, domain=sides, devices=1)
         base = base or seconds
-        print(f"| {sides}³ | {seconds * 1e3:.2f} | {seconds / base:.2f} |", flush=True)
+        print(row(f"{sides}³", f"{seconds * 1e3:.2f}", f"{seconds / base:.2f}"))
 
 
-def features(arguments):
-    """What each feature costs a scene that has it; a scene without it traces nothing of it (tests)."""
+def features(_):
+    """Cost of each feature in a scene that has it; a scene without it traces nothing of it (tests)."""
     still = Plane(point=jnp.asarray([0, 0, 0.3]), normal=jnp.asarray([0, 0, 1.0]))
     moving = eqx.tree_at(lambda p: p.velocity, still, jnp.asarray([0, 0, 0.1]), is_leaf=lambda leaf: leaf is None)
     cases = {
@@ -230,16 +218,15 @@ def features(arguments):
         "moving collider": {"colliders": (moving,)},
         "contact of two bodies": {"contact": BodyContact(bodies=2)},
     }
-    print("| feature, fixed corotated 100k/64³, one device | ms per substep | against none |")
-    print("|---|---|---|")
+    print(head("feature, fixed corotated 100k/64³, one device", "ms per substep", "against none"))
     base = None
     for name, case in cases.items():
         _, seconds, _, _ = ours("fixed_corotated", 100_000, 64, devices=1, **case)
         base = base or seconds
-        print(f"| {name} | {seconds * 1e3:.2f} | {seconds / base:.2f} |", flush=True)
+        print(row(name, f"{seconds * 1e3:.2f}", f"{seconds / base:.2f}"))
 
 
-def sleep(arguments):
+def sleep(_):
     """A frame of 20 substeps of a block of 90k particles at rest and one of 10k that flies past it, one device."""
     particles, grid, table = scene("fixed_corotated", 100_000, 64, domain=128)
     flying = jnp.arange(100_000) >= 90_000
@@ -248,8 +235,7 @@ def sleep(arguments):
     particles = eqx.tree_at(lambda p: (p.x, p.v, p.body), particles, (x, v, flying.astype(jnp.int32)))
     settings, step = SimConfig(devices=1), {"frames": 1, "substeps": 20, "start": jnp.float32(0)}
     step |= {"dt": jnp.float32(DT), "gravity": jnp.zeros(3), "colliders": (), "contact": None}
-    print("| asleep | ms per frame | against no sleep | compile s |")
-    print("|---|---|---|---|")
+    print(head("asleep", "ms per frame", "against no sleep", "compile s"))
     base = None
     for name, asleep in (("sleep=None", None), ("none", (0, 0)), ("the block", (1, 0)), ("both", (1, 1))):
         fit = Fit() if asleep is None else Sleeper(settings=Sleep(), body=np.asarray(particles.body))
@@ -259,15 +245,15 @@ def sleep(arguments):
                 fit.asleep, fit.still = np.array(asleep, bool), 99 * np.array(asleep)
             return fit.frame(particles, grid, table, settings, 1, **step)
 
-        first, seconds, _ = timed(frame)
-        base = base or seconds
-        print(f"| {name} | {seconds * 1e3:.1f} | {seconds / base:.2f} | {first - seconds:.1f} |", flush=True)
+        found = timed(frame, windows=5)
+        base = base or found.seconds
+        times = f"{found.seconds * 1e3:.1f}", f"{found.seconds / base:.2f}", f"{found.compile_seconds:.1f}"
+        print(row(name, *times))
 
 
-def batch(arguments):
+def batch(_):
     """Simulations of 1,000 particles together by vmap, against one after another."""
-    print("| simulations of 1k/24³, 20 steps | together ms | one after another ms | gain |")
-    print("|---|---|---|---|")
+    print(head("simulations of 1k/24³, 20 steps", "together ms", "one after another ms", "gain"))
     particles, _, table = scene("neo_hookean", 1000, 24)
     grid = fit_grid(particles.x, 1 / 24, margin=1 / 24)
 
@@ -279,52 +265,30 @@ def batch(arguments):
     single, together = jax.jit(end), jax.jit(jax.vmap(end))
     for count in (1, 4, 16):
         young = jnp.linspace(1e4, 1e5, count)
-        _, vmapped, _ = timed(lambda young=young: together(young))
-        _, serial, _ = timed(lambda young=young: [single(e) for e in young])
-        print(f"| {count} | {vmapped * 1e3:.1f} | {serial * 1e3:.1f} | {serial / vmapped:.2f} |", flush=True)
+        runs = {"together": partial(together, young), "serial": lambda young=young: [single(e) for e in young]}
+        vmapped, serial = in_turn(runs, windows=5).values()
+        print(row(count, f"{vmapped.seconds * 1e3:.1f}", f"{serial.seconds * 1e3:.1f}", f"{serial.over(vmapped):.2f}"))
 
 
-def memory(arguments):
-    """Bytes of one compiled frame, and of the process."""
-    print("| case | temporary and output bytes per particle | gradient of 32 steps | process peak MB |")
-    print("|---|---|---|---|")
-    for count, nodes in ((100_000, 64), (500_000, 128)):
-        particles, _, table = scene("fixed_corotated", count, nodes)
-        grid = fit_grid(particles.x, 1 / nodes, margin=2 / nodes)
-        settings, step = SimConfig(substeps=32, devices=1), {"frames": 1, "substeps": 32, "start": jnp.float32(0)}
-        step |= {"dt": jnp.float32(DT), "gravity": jnp.asarray(DOWN), "colliders": (), "contact": None}
-        used = run_frames.lower(particles, whole(grid), table, settings, 1, **step).compile().compiled.memory_analysis()
-
-        def height(x, particles=particles, grid=grid, table=table, settings=settings):
-            moved = eqx.tree_at(lambda p: p.x, particles, x)
-            return rollout(moved, grid, table, settings, frames=1, frame_dt=32 * DT, gravity=DOWN)[0].x.sum()
-
-        back = jax.jit(jax.grad(height)).lower(particles.x).compile().memory_analysis()
-        jax.block_until_ready(rollout(particles, grid, table, settings, frames=1, frame_dt=32 * DT, gravity=DOWN)[0].x)
-        total = [(m.temp_size_in_bytes + m.output_size_in_bytes) / count for m in (used, back)]
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-        print(f"| {count // 1000}k/{nodes}³ | {total[0]:.0f} | {total[1]:.0f} | {peak} |", flush=True)
+def memory(options):
+    """Bytes of one compiled frame and of its gradient, and of the process."""
+    print(head("case", "temporary and output bytes per particle", "gradient of 32 steps", "process peak MB"))
+    for count, nodes in cases(options):
+        particles, compiled = compiled_frame("fixed_corotated", count, nodes, 32)
+        _, back = compiled_frame("fixed_corotated", count, nodes, 32, gradient=True)
+        jax.block_until_ready(compiled(particles))
+        used = [program.memory_analysis() for program in (compiled, back)]
+        total = [f"{(m.temp_size_in_bytes + m.output_size_in_bytes) / count:.0f}" for m in used]
+        print(row(f"{count // 1000}k/{nodes}³", *total, f"{1e3 * peak_memory():.0f}"))
 
 
-PARTS = {part.__name__: part for part in (speed, stages, laws, gradient, domain, features, sleep, batch, memory)}
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", metavar="part", help=", ".join(PARTS))
-    parser.add_argument(
-        "--laws", nargs="+", default=["fixed_corotated", "neo_hookean"], help="of parts speed and stages"
-    )
-    parser.add_argument("--rounds", type=int, default=1, help="of part speed")
-    parser.add_argument("--rivals", help="Python with Taichi and Warp")
-    parser.add_argument("--peers", default="../shared/peers", help="folder of the rivals' scripts")
-    arguments = parser.parse_args()
-    use_host_devices()
-    print(machine(), f"load {os.getloadavg()[0]:.1f}")
-    for name in arguments.parts or PARTS:
-        print(f"\n{PARTS[name].__doc__}\n")
-        PARTS[name](arguments)
-
-
-if __name__ == "__main__":
-    main()
+STUDIES = (speed, stages, laws, gradient, domain, features, sleep, batch, memory)
+PARTS = {study.__name__: (study.__doc__.partition(":")[0].rstrip("."), study) for study in STUDIES}
+OPTIONS = {
+    "laws": {"nargs": "+", "default": ["fixed_corotated", "neo_hookean"], "help": "of parts speed and stages"},
+    "largest": {"type": int, "help": "particles in the cases of parts speed, stages and memory"},
+    "rounds": {"type": int, "default": 1, "help": "of part speed"},
+    "rivals": {"help": "Python with Taichi and Warp"},
+    "peers": {"type": Path, "default": ROOT.parent / "shared" / "peers", "help": "folder of the rivals' scripts"},
+}
+DEVICES = None

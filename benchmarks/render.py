@@ -1,47 +1,35 @@
-"""Drawing: time beside error, and beside rival engines in the same run: `python benchmarks/bench_render.py`.
+"""Drawing: time and error by size, by stage and by setting.
 
-Every row draws the same seeded ball of Gaussians (SH 3) and prints medians of warm calls: RGB and alpha forward, and
-the gradient of a loss over RGB to all parameters. Errors are against the same scene with every threshold off.
-Engines beside ours (`--rivals FOLDER`: a folder with the scripts tile_raster.py, raster_gsplat_torch.py, that print one
-JSON line) run in their own process before each row, so both meet the same machine.
+Every row draws the same seeded ball of Gaussians (SH 3): RGB and alpha forward, and the gradient of a loss over RGB to
+all parameters. Errors are against the same scene with every threshold off. Engines beside ours (`--rivals`: scripts as
+tile_raster.py and raster_gsplat_torch.py, that print one JSON line) run in their own process before each row, so both
+meet the same machine.
 """
 
-import argparse
 import json
-import os
-import resource
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmarks.common.timing import machine, measure, use_host_devices
 from jax import lax
+from matplotlib.figure import Figure
 
+from benchmarks.common.pages import head, picture, row
+from benchmarks.common.timing import in_turn, measure, peak_memory
 from pigjax import Gaussians, RenderConfig, look_at, render, stack_cameras
-from pigjax.splatting.binning import blend_config, front_to_back, list_pass
+from pigjax.splatting.binning import bands_of, blend_config, front_to_back, list_pass
 from pigjax.splatting.compositor import blend
 from pigjax.splatting.projection import project_splats
 from pigjax.splatting.sh import colours
 from pigjax.splatting.sharding import replicate
 from pigjax.splatting.types import as_splats
 
-parser = argparse.ArgumentParser(description=__doc__)
-parser.add_argument("--rows", nargs="*", default=["1000:256", "10000:256", "10000:512", "100000:256", "100000:512"],
-                    help="splats:pixels or splats:widthxheight")  # fmt: skip
-parser.add_argument("--devices", type=int, default=len(os.sched_getaffinity(0)), help="host devices on a CPU")
-parser.add_argument("--rivals", type=Path, nargs="*", default=[], help="scripts to time in turn with ours")
-parser.add_argument("--stages", action="store_true", help="also time projecting, ordering, listing, blending")
-parser.add_argument("--settings", action="store_true", help="time and error of each approximation on 10k / 256²")
-parser.add_argument("--growth", action="store_true", help="time against splats, pixels and views; writes --plot")
-parser.add_argument("--plot", type=Path, help="picture of --growth")
-parser.add_argument("--forward-only", action="store_true")
-options = parser.parse_args()
-use_host_devices(options.devices)
-
+PLOT = "render_growth.png"
 EXACT = RenderConfig(alpha_min=1e-6, transmittance_min=0.0)
 
 
@@ -62,6 +50,12 @@ def ball(count, width, height):
     return Gaussians(*(jnp.asarray(v, jnp.float32) for v in values)), camera
 
 
+def shared(count, width, height, devices):
+    """The ball on each of so many devices, and the setting with which they share its image."""
+    scene, config = ball(count, width, height), RenderConfig(bands=devices)
+    return config, replicate(scene, bands_of(scene[1], config))
+
+
 def loss(gaussians, camera, config):
     return jnp.sum(render(gaussians, camera, config, outputs=("rgb",)).rgb ** 2)
 
@@ -76,59 +70,74 @@ def size_of(text):
     return int(count), int(width), int(height)
 
 
-def row(text, bands):
+def sizes(options):
+    """Ours on one and on all devices, for each size."""
+    print(head("splats", "pixels", "devices", "forward ms", "and backward ms", "compile s", "PSNR dB", "worst error",
+               "peak GB"))  # fmt: skip
+    for text in options.rows:
+        rivals(text, options.rivals)
+        for bands in sorted({1, jax.local_device_count()}):
+            print(row(*columns(text, bands, options.forward_only)))
+
+
+def columns(text, bands, forward_only):
     count, width, height = size_of(text)
-    scene = replicate(ball(count, width, height), bands)
-    config = RenderConfig(bands=bands)
-    compile_forward, forward, frame = measure(lambda g, c: render(g, c, config), *scene)
-    line = f"{count:>8} {width}x{height}  bands {bands}  fwd {forward * 1e3:8.1f} ms (compile {compile_forward:.1f} s)"
-    if not options.forward_only:
-        compile_both, both, _ = measure(jax.value_and_grad(lambda g, c: loss(g, c, config)), *scene)
-        line += f"  fwd+bwd {both * 1e3:8.1f} ms (compile {compile_both:.1f} s)"
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    config, scene = shared(count, width, height, bands)
+    forward = measure(lambda g, c: render(g, c, config), *scene)
+    times, compiled = [f"{forward.seconds * 1e3:.1f}"], [f"{forward.compile_seconds:.1f}"]
+    if not forward_only:
+        both = measure(jax.value_and_grad(lambda g, c: loss(g, c, config)), *scene)
+        times.append(f"{both.seconds * 1e3:.1f}")
+        compiled.append(f"{both.compile_seconds:.1f}")
+    peak, errors = peak_memory(), ("", "")
     if count * width * height <= 100_000 * 512**2:
         truth = jax.jit(lambda g, c: render(g, c, EXACT))(*ball(count, width, height))
-        worst = float(jnp.abs(jax.device_get(frame.rgb) - truth.rgb).max())
-        line += f"  error {psnr(frame.rgb, truth.rgb):.1f} dB, worst {worst:.1e}"
-    print(f"{line}  peak so far {peak:.2f} GiB", flush=True)
+        ours = jax.device_get(forward.result.rgb)
+        errors = f"{psnr(ours, truth.rgb):.1f}", f"{float(jnp.abs(ours - truth.rgb).max()):.1e}"
+    return count, f"{width}x{height}", bands, *[*times, ""][:2], " + ".join(compiled), *errors, f"{peak:.2f}"
 
 
-def rivals(text):
+def rivals(text, scripts):
+    """Their times, each a line in the first column."""
     count, width, _ = size_of(text)
-    for script in options.rivals:
+    for script in scripts:
         for mode in ("fwd", "fwdbwd"):
             for threads in (1, 2):
                 command = [sys.executable, str(script), "--gaussians", str(count), "--size", str(width), "--mode", mode]
                 done = subprocess.run([*command, "--threads", str(threads)], capture_output=True, text=True)
                 if done.returncode:
-                    print(f"    {script.name}: {done.stderr.strip().splitlines()[-1]}")
+                    print(row(f"{script.name}: {done.stderr.strip().splitlines()[-1]}"))
                     break
                 result = json.loads(done.stdout.strip().splitlines()[-1])
-                print(f"    {result['name']} {mode} {threads} thread(s)  {result['median_s'] * 1e3:.1f} ms", flush=True)
+                print(row(f"{result['name']} {mode} {threads} thread(s): {result['median_s'] * 1e3:.1f} ms"))
 
 
-def stages(text):
-    count, width, height = size_of(text)
+def stages(options):
+    """Where the time goes, one device."""
+    print(head("ms", "pose", "project", "colour", "order", "first list", "order, lists, blend", "and backward"))
+    for text in options.rows:
+        print(row(text, *(f"{1e3 * seconds:.1f}" for seconds in seconds_of_stages(*size_of(text)))))
+
+
+def seconds_of_stages(count, width, height):
     gaussians, camera = ball(count, width, height)
     config = RenderConfig()
     blending = blend_config(camera, config, count, surface=False)
-    _, seconds, splats = measure(as_splats, gaussians)
-    times = {"pose": seconds}
-    _, times["project"], projected = measure(lambda s, c: project_splats(s, c, config), splats, camera)
-    _, times["colour"], rgb = measure(colours, splats, camera)
-    _, times["order"], boxes = measure(lambda p: front_to_back(p, blending), projected)
-    shapes, tiles = projected.shapes[boxes.order], jnp.ones(blending.tiles, bool)
-    _, times["first list"], _ = measure(
-        lambda s, b, t: list_pass(s, b, 0, t, blending, blending.slots), shapes, boxes, tiles
-    )
-    _, times["order+lists+blend"], _ = measure(lambda p, f: blend(p, f, blending)[:2], projected, rgb)
+    pose = measure(as_splats, gaussians)
+    project = measure(lambda s, c: project_splats(s, c, config), pose.result, camera)
+    colour = measure(colours, pose.result, camera)
+    order = measure(lambda p: front_to_back(p, blending), project.result)
+    shapes, tiles = project.result.shapes[order.result.order], jnp.ones(blending.tiles, bool)
+    first = measure(lambda s, b, t: list_pass(s, b, 0, t, blending, blending.slots), shapes, order.result, tiles)
+    whole = measure(lambda p, f: blend(p, f, blending)[:2], project.result, colour.result)
     slope = jax.grad(lambda p, f: jnp.sum(blend(p, f, blending).features ** 2), argnums=1)
-    _, times["the same and backward"], _ = measure(slope, projected, rgb)
-    print(f"    {text}, one device, ms: " + ", ".join(f"{name} {t * 1e3:.1f}" for name, t in times.items()), flush=True)
+    backward = measure(slope, project.result, colour.result)
+    return [run.seconds for run in (pose, project, colour, order, first, whole, backward)]
 
 
-def settings():
-    """Each approximation alone against all thresholds off."""
+def settings(_):
+    """Each approximation alone against all thresholds off, on 10k / 256²."""
+    print(head("setting", "forward ms", "and backward ms", "PSNR dB", "worst error"))
     gaussians, camera = ball(10_000, 256, 256)
     truth = render(gaussians, camera, EXACT).rgb
     changes = [{}, {"alpha_min": 1e-6}, {"transmittance_min": 0.0}, {"transmittance_min": 1e-2}, {"alpha_max": 0.999},
@@ -136,72 +145,67 @@ def settings():
                {"tile_size": 8}, {"tile_size": 32}, {"chunk": 32}, {"slots": 2**14}]  # fmt: skip
     for change in changes:
         config = replace(RenderConfig(), **change)
-        _, forward, frame = measure(lambda g, c, config=config: render(g, c, config), gaussians, camera)
-        _, both, _ = measure(jax.value_and_grad(lambda g, c, config=config: loss(g, c, config)), gaussians, camera)
+        forward, both = time_both(config, (gaussians, camera))
         name = ", ".join(f"{k}={v:g}" for k, v in change.items()) or "defaults"
-        worst = float(jnp.abs(frame.rgb - truth).max())
-        print(f"    {name:26} fwd {forward * 1e3:6.1f}  fwd+bwd {both * 1e3:6.1f} ms  "
-              f"{psnr(frame.rgb, truth):6.1f} dB  worst {worst:.1e}", flush=True)  # fmt: skip
+        image = forward.result.rgb
+        times = f"{forward.seconds * 1e3:.1f}", f"{both.seconds * 1e3:.1f}"
+        print(row(name, *times, f"{psnr(image, truth):.1f}", f"{float(jnp.abs(image - truth).max()):.1e}"))
 
 
-def growth(bands):
+def growth(options):
     """Time against splats, pixels and views."""
-    config, series = RenderConfig(bands=bands), {}
+    devices, series = jax.local_device_count(), {}
     for count in (1_000, 10_000, 100_000, 1_000_000):
-        scene = replicate(ball(count, 512, 512), bands)
-        series.setdefault("splats at 512²", []).append((count, time_both(scene, config)))
+        series.setdefault("splats at 512²", []).append((count, time_both(*shared(count, 512, 512, devices))))
     for width, height in ((128, 128), (256, 256), (512, 512), (1024, 1024), (1920, 1080)):
-        scene = replicate(ball(100_000, width, height), bands)
-        series.setdefault("pixels, 100k splats", []).append((width * height, time_both(scene, config)))
+        times = time_both(*shared(100_000, width, height, devices))
+        series.setdefault("pixels, 100k splats", []).append((width * height, times))
     gaussians, camera = ball(10_000, 256, 256)
     for views in (1, 4, 16):
         cameras = stack_cameras([camera] * views)
-        ways = (lambda g, c: lax.map(lambda c: render(g, c).rgb, c), jax.vmap(lambda g, c: render(g, c).rgb, (None, 0)))
-        times = [measure(way, gaussians, cameras, repeats=5)[1] for way in ways]
-        print(f"    {views:3} views of 10k / 256²: lax.map {times[0] * 1e3:.1f} ms, vmap {times[1] * 1e3:.1f} ms")
-    scene = replicate(ball(1_000_000, 1920, 1080), bands)
-    series["1M / 1080p"] = [(1_000_000, time_both(scene, config))]
+        runs = {
+            "lax.map": jax.jit(lambda g, c: lax.map(lambda c: render(g, c).rgb, c)),
+            "vmap": jax.jit(jax.vmap(lambda g, c: render(g, c).rgb, (None, 0))),
+        }
+        found = in_turn({name: partial(run, gaussians, cameras) for name, run in runs.items()}, windows=5)
+        print(f"{views} views of 10k / 256²: " + ", ".join(f"{k} {1e3 * t.seconds:.1f} ms" for k, t in found.items()))
+    series["1M / 1080p"] = [(1_000_000, time_both(*shared(1_000_000, 1920, 1080, devices)))]
+    print("\n" + head("series", "size", "forward ms", "and backward ms"))
     for name, points in series.items():
-        for x, (forward, both) in points:
-            print(f"    {name}: {x:>9}  fwd {forward * 1e3:8.1f}  fwd+bwd {both * 1e3:8.1f} ms", flush=True)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(f"    peak memory of all of these: {peak:.2f} GiB")
-    if options.plot:
-        plot(series)
+        for x, times in points:
+            print(row(name, x, *(f"{run.seconds * 1e3:.1f}" for run in times)))
+    plot(series, options.media / PLOT)
+    return "\n" + picture(PLOT, "time against splats and pixels")
 
 
-def time_both(scene, config):
-    _, forward, _ = measure(lambda g, c: render(g, c, config), *scene, repeats=5)
-    _, both, _ = measure(jax.value_and_grad(lambda g, c: loss(g, c, config)), *scene, repeats=5)
-    return forward, both
+def time_both(config, scene):
+    forward = measure(lambda g, c: render(g, c, config), *scene, windows=5)
+    return forward, measure(jax.value_and_grad(lambda g, c: loss(g, c, config)), *scene, windows=5)
 
 
-def plot(series):
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")
+def plot(series, path):
+    figure = Figure(figsize=(8, 3), layout="constrained", dpi=110)
+    axes = figure.subplots(1, 2)
     for axis, name in zip(axes, ("splats at 512²", "pixels, 100k splats")):
         x, times = zip(*series[name])
         for index, label in enumerate(("forward", "forward + backward")):
-            axis.loglog(x, [1e3 * t[index] for t in times], "o-", label=label)
+            axis.loglog(x, [1e3 * t[index].seconds for t in times], "o-", label=label)
         axis.set(xlabel=name, ylabel="ms")
         axis.grid(alpha=0.3, which="both")
     axes[0].legend()
-    figure.savefig(options.plot, dpi=110)
+    figure.savefig(path)
 
 
-print(machine())
-if options.settings:
-    settings()
-if options.growth:
-    growth(jax.local_device_count())
-if not (options.settings or options.growth):
-    for text in options.rows:
-        rivals(text)
-        for bands in sorted({1, jax.local_device_count()}):
-            row(text, bands)
-        if options.stages:
-            stages(text)
+PARTS = {
+    "sizes": ("Drawing by size", sizes),
+    "stages": ("Drawing by stage", stages),
+    "settings": ("Drawing by setting", settings),
+    "growth": ("Growth of the time of drawing", growth),
+}
+OPTIONS = {
+    "rows": {"nargs": "*", "default": ["1000:256", "10000:256", "10000:512", "100000:256", "100000:512"],
+             "help": "splats:pixels or splats:widthxheight, of parts sizes and stages"},
+    "rivals": {"type": Path, "nargs": "*", "default": [], "help": "scripts to time in turn with ours, of part sizes"},
+    "forward-only": {"action": "store_true", "help": "of part sizes"},
+}  # fmt: skip
+DEVICES = None

@@ -1,28 +1,23 @@
-"""What a sweep costs: `python benchmarks/bench_sweep.py [part ...]`; parts: batches, clamp, processes. All without one.
+"""Cost of a sweep, in batches on several devices and in several processes.
 
-batches: simulations of a small block, one by one in a loop of a jitted function, and as sweeps on one and two devices.
+batches: simulations of a small block, one by one in a loop of a jitted function, and as sweeps on one and all devices.
 clamp: 64 weights of the clamp on the bundled tabletop, against simulating it again for each.
-processes: the sweep of `batches` in one process, and in two on this computer that share its cores.
-
-Times are warm medians; compile time apart.
+processes: the sweep of `batches` in one process, and in two on this computer that share its processor.
 """
 
-import argparse
 import json
 import os
 import socket
-import statistics
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmarks.common.timing import machine, use_host_devices
 from jax.sharding import Mesh
 
+from benchmarks.common.command import start_worker
+from benchmarks.common.pages import TABLETOP, head, row
+from benchmarks.common.timing import Timed, clock, timed, use_host_devices
 from pigjax import ClampParams, Material, SimConfig, load_scene, material_table, psnr, render, rollout, sweep
 from pigjax.core.linalg import svd
 from pigjax.coupling.binding import at_frame, deform
@@ -30,15 +25,14 @@ from pigjax.mpm import Grid, make_particles, vast_grid
 from pigjax.mpm.colliders import Plane
 from pigjax.scene.plan import make_cameras, make_plan, read_inputs, segment
 
-TABLETOP = Path(__file__).parents[1] / "examples" / "tabletop" / "scene.toml"
 PARTICLES, NODES, STEPS = 2000, 24, 100
 NEEDLE = 8.0  # times longer than its middle axis
 
 
-def block(row):
+def block(values):
     """Height to which a falling block of some stiffness and Poisson's ratio has sunk after a tenth of a second."""
     x = np.random.default_rng(0).random((PARTICLES, 3)).astype(np.float32) * 0.3 + [0.35, 0.35, 0.15]
-    material = Material("fixed_corotated", density=1000.0, young=row["young"], poisson=row["poisson"])
+    material = Material("fixed_corotated", density=1000.0, young=values["young"], poisson=values["poisson"])
     table = material_table([material])
     particles = make_particles(
         jnp.asarray(x, jnp.float32), volume=0.3**3 / PARTICLES, table=table, velocity=jnp.array([0.0, 0.0, -2.0])
@@ -59,55 +53,48 @@ def softnesses(count):
     ]
 
 
-def batch_seconds(fn, rows, repeats=3, **options):
-    """Seconds to the first batch's end, and the median of later ones, of a sweep over the same rows again and again."""
+def timed_batches(fn, rows, windows=3, **options):
+    """A sweep over the same rows again and again: each batch is a window. The result is the table of one."""
     ends = [time.perf_counter()]
-    again = rows * (repeats + 1)
+    again = rows * (windows + 1)
     table = sweep(fn, again, batch=len(rows), callback=lambda done, of: ends.append(time.perf_counter()), **options)
-    spent = np.diff(ends)
-    warm = statistics.median(spent[1:])
-    return spent[0] - warm, warm, table.select(np.arange(len(again)) < len(rows))
+    first, *warm = np.diff(ends).tolist()
+    return Timed(tuple(warm), first - float(np.median(warm)), table.select(np.arange(len(again)) < len(rows)))
 
 
-def batches():
-    print(f"block of {PARTICLES} particles, {STEPS} steps; rows/s, compile apart")
+def batches(options):
+    """Print rows per second of a loop, and of sweeps on one device and on all."""
+    print(f"Block of {PARTICLES} particles, {STEPS} steps.\n")
+    print(head("rows", "by", "rows/s", "compile s", "largest difference to the loop"))
     one = jax.jit(block)
-    begun = time.perf_counter()
-    one(softnesses(1)[0]).block_until_ready()
-    compiling = time.perf_counter() - begun
-    for count in (1, 4, 16, 64):
+    for count in options.rows:
         rows = softnesses(count)
-        begun = time.perf_counter()
-        values = np.array([one(row) for row in rows])
-        seconds = time.perf_counter() - begun
-        print(f"{count:3d} rows  loop {count / seconds:6.2f}/s (compile {compiling:.1f} s)", end="", flush=True)
-        for devices in (1, 2):
-            if count < devices:
-                continue
-            mesh = Mesh(np.array(jax.devices()[:devices]), ("rows",))
-            compiled, seconds, table = batch_seconds(block, rows, mesh=mesh)
-            apart = np.abs(table["value"] / values - 1).max()
-            print(f"  {devices} device(s) {count / seconds:6.2f}/s (compile {compiled:.1f} s, off {apart:.0e})", end="")
-        print(flush=True)
+        loop = timed(lambda rows=rows: np.array([one(values) for values in rows]), windows=3)
+        print(row(count, "loop", f"{count / loop.seconds:.2f}", f"{loop.compile_seconds:.1f}", ""))
+        most = max(n for n in range(1, jax.local_device_count() + 1) if count % n == 0)
+        for devices in sorted({1, most}):
+            mesh = Mesh(np.array(jax.local_devices()[:devices]), ("rows",))
+            run = timed_batches(block, rows, mesh=mesh)
+            apart = np.abs(run.result["value"] / loop.result - 1).max()
+            rate, compiled = f"{count / run.seconds:.2f}", f"{run.compile_seconds:.1f}"
+            print(row(count, f"sweep, {devices} device(s)", rate, compiled, f"{apart:.0e}"))
 
 
-def clamp():
-    frames, of_demo = 8, load_scene(TABLETOP).simulation.frames
-    scene = load_scene(TABLETOP)
+def clamp(_):
+    """Print the time of 64 weights of the clamp beside that of a simulation."""
+    scene = load_scene(TABLETOP / "scene.toml")
+    frames, of_demo = 8, scene.simulation.frames
     inputs = read_inputs(scene)
     plan = make_plan(scene, inputs, segment(scene, inputs))
 
     def simulate():
-        begun = time.perf_counter()
-        result = rollout(
+        return rollout(
             plan.particles, vast_grid(scene.simulation.dx), plan.table, plan.config, frames=frames,
             frame_dt=plan.frame_dt, gravity=plan.gravity, colliders=plan.colliders, contact=plan.contact,
         )  # fmt: skip
-        jax.block_until_ready(result[0].x)
-        return time.perf_counter() - begun, result[1]
 
-    cold, trajectory = simulate()
-    warm, trajectory = simulate()
+    simulated = timed(simulate, windows=1)
+    warm, trajectory = simulated.seconds, simulated.result[1]
     camera = make_cameras(scene, inputs, np.zeros(3))[frames].resized(160, 120)
     moved = at_frame(plan.particles, trajectory, frames - 1)
     inside = plan.labels.object_id > 0
@@ -135,72 +122,59 @@ def clamp():
     shared = (*shared, unclamped(*shared))
     values = np.linspace(0.0, 1.4, 8, dtype=np.float32)
     rows = [{"lambda_R": r, "lambda_S": s} for r in values for s in values]
-    compiled, seconds, table = batch_seconds(score, rows, shared=shared)
-    print(
-        f"tabletop, {len(inputs.gaussians)} Gaussians, {len(plan.particles)} particles: {frames} of {of_demo} frames"
-        f" simulated in {warm:.1f} s (cold {cold:.1f} s)"
-    )
-    print(f"64 pairs of weights posed, drawn and scored at 160x120 in {seconds:.2f} s (compile {compiled:.1f} s)")
-    print(
-        f"sweep over 64 simulations: {seconds / (64 * warm):.2%} of {frames} frames,"
-        f" {seconds / (64 * warm * of_demo / frames):.2%} scaled to all {of_demo};"
-        f" with all compilation {(seconds + compiled) / (64 * warm):.2%} of {frames} frames"
-    )
+    swept = timed_batches(score, rows, shared=shared)
+    seconds, compiled, table = swept.seconds, swept.compile_seconds, swept.result
     best = table.best("needles")
-    print(
-        f"needles {table['needles'].min():.2%} to {table['needles'].max():.2%}, psnr to the unclamped picture"
+    return (
+        f"Tabletop, {len(inputs.gaussians)} Gaussians, {len(plan.particles)} particles: {frames} of {of_demo} frames"
+        f" simulated in {warm:.1f} s (compile {simulated.compile_seconds:.1f} s).\n\n"
+        f"64 pairs of weights posed, drawn and scored at 160x120 in {seconds:.2f} s (compile {compiled:.1f} s).\n\n"
+        f"Sweep over 64 simulations: {seconds / (64 * warm):.2%} of {frames} frames,"
+        f" {seconds / (64 * warm * of_demo / frames):.2%} scaled to all {of_demo};"
+        f" with all compilation {(seconds + compiled) / (64 * warm):.2%} of {frames} frames.\n\n"
+        f"Needles {table['needles'].min():.2%} to {table['needles'].max():.2%}, PSNR to the unclamped picture"
         f" {table['psnr'].min():.1f} to {table['psnr'].max():.1f} dB; fewest at lambda_R {best['lambda_R']:.1f},"
-        f" lambda_S {best['lambda_S']:.1f}"
+        f" lambda_S {best['lambda_S']:.1f}."
     )
 
 
 def worker(port, process, of):
-    jax.config.update("jax_num_cpu_devices", 2 // of)
-    if of > 1:
-        jax.distributed.initialize(f"127.0.0.1:{port}", num_processes=of, process_id=process)
-    compiled, seconds, table = batch_seconds(block, softnesses(16))
-    if process == 0:
-        print(json.dumps({"compiled": compiled, "seconds": seconds, "values": table["value"].tolist()}))
+    """The sweep in one of some processes with two devices in all; the first prints what it took."""
+    use_host_devices(2 // int(of))
+    if int(of) > 1:
+        jax.distributed.initialize(f"127.0.0.1:{port}", num_processes=int(of), process_id=int(process))
+    run = timed_batches(block, softnesses(16))
+    if int(process) == 0:
+        values = run.result["value"].tolist()
+        print(json.dumps({"compiled": run.compile_seconds, "seconds": run.seconds, "values": values}))
 
 
-def processes():
-    print("16 rows, two devices in all")
+def processes(_):
+    """Print rows per second of one process and of two, on the processor whatever else there is."""
+    print("16 rows, two devices in all.\n")
+    print(head("processes", "rows/s", "compile s", "from start to end [s]"))
     values = []
     for of in (1, 2):
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
-        begun = time.perf_counter()
-        started = [
-            subprocess.Popen(
-                [sys.executable, __file__, "--worker", str(port), str(process), str(of)],
-                stdout=subprocess.PIPE,
-                env=os.environ,
-                text=True,
-            )
-            for process in range(of)
-        ]
-        said = [process.communicate()[0] for process in started]
-        whole = time.perf_counter() - begun
+        env = {**os.environ, "JAX_PLATFORMS": "cpu"}
+
+        def run(of=of, port=port, env=env):
+            started = [start_worker("sweep", port, process, of, env=env) for process in range(of)]
+            return [process.communicate()[0] for process in started]
+
+        whole, said = clock(run)
         found = json.loads(said[0].splitlines()[-1])
         values.append(found["values"])
-        print(
-            f"{of} process(es) {16 / found['seconds']:6.2f} rows/s"
-            f" (compile {found['compiled']:.1f} s, from start to end {whole:.1f} s)",
-            flush=True,
-        )
-    print(f"greatest difference between the tables {np.abs(np.subtract(*values)).max():.1e}")
+        print(row(of, f"{16 / found['seconds']:.2f}", f"{found['compiled']:.1f}", f"{whole:.1f}"))
+    return f"\nLargest difference between the tables: {np.abs(np.subtract(*values)).max():.1e}."
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", default=["batches", "clamp", "processes"])
-    parser.add_argument("--worker", nargs=3, type=int, help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.worker:
-        worker(*given.worker)
-    else:
-        use_host_devices(2)
-        print(machine())
-        for part in given.parts:
-            {"batches": batches, "clamp": clamp, "processes": processes}[part]()
+PARTS = {
+    "batches": ("Sweeps in batches", batches),
+    "clamp": ("A sweep of the clamp's weights", clamp),
+    "processes": ("Sweeps in several processes", processes),
+}
+OPTIONS = {"rows": {"nargs": "+", "type": int, "default": [1, 4, 16, 64], "help": "of the sweeps of part batches"}}
+DEVICES = None

@@ -151,7 +151,6 @@ def _bound_memory():
 def _read_one(reader, folder, rng, others):
     """Damage a file of the folder, read, and put the file back."""
     from benchmarks.fuzz.damage import damaged
-
     from pigjax.core.errors import InputError
 
     file, change = _damage_of(reader, folder, rng, others, damaged)

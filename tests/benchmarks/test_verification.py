@@ -1,4 +1,4 @@
-"""Cases of docs/results/VERIFICATION.md in their cheapest form; each tolerance is the figure seen there and some room."""
+"""Cases of docs/results/VERIFICATION.md in their cheapest form; a tolerance is the figure seen there and some room."""
 
 import math
 
@@ -6,13 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
 from benchmarks.verification.bars import period
 from benchmarks.verification.bodies import TOUCH, discs, modulus, parting, sag
 from benchmarks.verification.classic import classic_force
 from benchmarks.verification.flows import FRONT_T, FRONT_Z, column, friction_angle, front, lube
 from benchmarks.verification.kernels import energy_kept, ringing, turning
 from benchmarks.verification.manufactured import cube_error, free_error, vortex_error
-
 from pigjax.mls_mpm import SimConfig, step
 from pigjax.mpm import Grid, make_particles
 from pigjax.mpm.contact import BodyContact
