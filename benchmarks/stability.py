@@ -194,17 +194,17 @@ def all_nan(law):
 
 
 def alone_and_coincident(law):
-    """27 points 3.5 cells apart with four or five particles each fall freely; error of the way."""
+    """27 points 3.5 cells apart with four or five particles each fall freely; error of the distance."""
     points = np.stack(np.meshgrid(*[np.array([4.0, 7.5, 11.0]) * DX] * 3, indexing="ij"), -1).reshape(-1, 3)
     table = table_of(law)
     start = cube(table, x=points[np.arange(SIDE**3) % 27])
     end, _, health, dt = run(start, table, gravity=(0.0, 0.0, -1.0), dt=1e-3)
-    way = -(dt**2) * 200 * 201 / 2
-    return outcome(health, end, f"{np.abs((end.x - start.x)[:, 2] / way - 1).max():.0e}")
+    distance = -(dt**2) * 200 * 201 / 2
+    return outcome(health, end, f"{np.abs((end.x - start.x)[:, 2] / distance - 1).max():.0e}")
 
 
 def fast(law):
-    """1e5 m/s through a domain of 1 km; error of the way."""
+    """1e5 m/s through a domain of 1 km; error of the distance."""
     table = table_of(law, size=1e3)
     start = cube(table, size=1e3, centre=(0.3, 0.5, 0.5), velocity=(1e5, 0.0, 0.0))
     end, _, health, dt = run(start, table, grid=grid_of(1e3), share=0.05)
@@ -247,7 +247,7 @@ def far(offset):
 
 
 def slow_drift(young):
-    """1 mm/s in matter of that stiffness; error of the way in 200 steps."""
+    """1 mm/s in matter of that stiffness; error of the distance in 200 steps."""
 
     def case(law):
         table = table_of(law, young=young)
@@ -276,12 +276,12 @@ EXTREMES = {
     "F is NaN: others": bad_number("F", jnp.nan),
     "volume is NaN: others": bad_number("volume0", jnp.nan),
     "all x are NaN": all_nan,
-    "alone, coincident: way": alone_and_coincident,
-    "1e5 m/s: way": fast,
+    "alone, coincident: distance": alone_and_coincident,
+    "1e5 m/s: distance": fast,
     "1e5 m/s into the floor": fast_impact,
     **{f"scene × {size:g}: cells": scaled(size) for size in (1e-6, 1e-3, 1e3, 1e4)},
     **{f"{offset:g} m from the origin: spacings": far(offset) for offset in (1e3, 1e4)},
-    **{f"1 mm/s at E = {e:g}: way": slow_drift(e) for e in (1e5, 1e7, 1e9)},
+    **{f"1 mm/s at E = {e:g}: distance": slow_drift(e) for e in (1e5, 1e7, 1e9)},
 }
 
 
@@ -404,7 +404,7 @@ Every law that moves meets every extreme: 125 particles of two materials in 16³
 kg/m³, 200 steps of the stable length unless stated, longer ones forced. A cell tells the counts of `Health` (`esc` left
 the grid, `inv` turned inside out, `nan` became NaN or infinite, `cfl` cells in a step; `ok` nothing), then a number:
 *energy*, the most kinetic energy of any frame in parts of that given; *momentum*, lost share; *others*, how far
-[cells] the other particles are from where they go without that one; *way*, relative error of the distance in
+[cells] the other particles are from where they go without that one; *distance*, relative error of the distance in
 free flight; *cells*,
 difference from the scene of ordinary size, scaled back; *spacings*, difference from the origin in spacings of
 floating point there. Plastic laws and fluids put an F that is flat or inside out in order before the first step.
