@@ -18,12 +18,13 @@ from jax.sharding import Mesh
 from benchmarks.common.command import start_worker
 from benchmarks.common.pages import TABLETOP, head, row
 from benchmarks.common.timing import Timed, clock, timed, use_host_devices
+from benchmarks.tradeoff.scenes import simulate, source
 from pigjax import ClampParams, Material, SimConfig, load_scene, material_table, psnr, render, rollout, sweep
 from pigjax.core.linalg import svd
 from pigjax.coupling.binding import at_frame, deform
-from pigjax.mpm import Grid, make_particles, vast_grid
+from pigjax.mpm import Grid, make_particles
 from pigjax.mpm.colliders import Plane
-from pigjax.scene.plan import make_cameras, make_plan, read_inputs, segment
+from pigjax.scene.plan import make_cameras
 
 PARTICLES, NODES, STEPS = 2000, 24, 100
 NEEDLE = 8.0  # times longer than its middle axis
@@ -82,20 +83,12 @@ def batches(options):
 
 def clamp(_):
     """Print the time of 64 weights of the clamp beside that of a simulation."""
-    scene = load_scene(TABLETOP / "scene.toml")
-    frames, of_demo = 8, scene.simulation.frames
-    inputs = read_inputs(scene)
-    plan = make_plan(scene, inputs, segment(scene, inputs))
-
-    def simulate():
-        return rollout(
-            plan.particles, vast_grid(scene.simulation.dx), plan.table, plan.config, frames=frames,
-            frame_dt=plan.frame_dt, gravity=plan.gravity, colliders=plan.colliders, contact=plan.contact,
-        )  # fmt: skip
-
-    simulated = timed(simulate, windows=1)
+    of, demo, frames = source("tabletop"), load_scene(TABLETOP / "scene.toml"), 8
+    scene, inputs = of.scene(simulation={"frames": frames}), of.inputs
+    plan = of.plan(scene)
+    simulated = timed(lambda: simulate(scene, plan), windows=1)
     warm, trajectory = simulated.seconds, simulated.result[1]
-    camera = make_cameras(scene, inputs, np.zeros(3))[frames].resized(160, 120)
+    camera = make_cameras(demo, inputs, np.zeros(3))[frames].resized(160, 120)
     moved = at_frame(plan.particles, trajectory, frames - 1)
     inside = plan.labels.object_id > 0
 
@@ -126,11 +119,11 @@ def clamp(_):
     seconds, compiled, table = swept.seconds, swept.compile_seconds, swept.result
     best = table.best("needles")
     return (
-        f"Tabletop, {len(inputs.gaussians)} Gaussians, {len(plan.particles)} particles: {frames} of {of_demo} frames"
-        f" simulated in {warm:.1f} s (compile {simulated.compile_seconds:.1f} s).\n\n"
+        f"Tabletop, {len(inputs.gaussians)} Gaussians, {len(plan.particles)} particles: {frames} of"
+        f" {demo.simulation.frames} frames simulated in {warm:.1f} s (compile {simulated.compile_seconds:.1f} s).\n\n"
         f"64 pairs of weights posed, drawn and scored at 160x120 in {seconds:.2f} s (compile {compiled:.1f} s).\n\n"
         f"Sweep over 64 simulations: {seconds / (64 * warm):.2%} of {frames} frames,"
-        f" {seconds / (64 * warm * of_demo / frames):.2%} scaled to all {of_demo};"
+        f" {seconds / (64 * warm * demo.simulation.frames / frames):.2%} scaled to all {demo.simulation.frames};"
         f" with all compilation {(seconds + compiled) / (64 * warm):.2%} of {frames} frames.\n\n"
         f"Needles {table['needles'].min():.2%} to {table['needles'].max():.2%}, PSNR to the unclamped picture"
         f" {table['psnr'].min():.1f} to {table['psnr'].max():.1f} dB; fewest at lambda_R {best['lambda_R']:.1f},"

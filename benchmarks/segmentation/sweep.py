@@ -69,10 +69,8 @@ def sweep_views(scene: Tabletop) -> dict[tuple[int, int], tuple[float, float]]:
     """Share right and warm seconds by number of views and by pixels along a side."""
     results = {}
     for size in SIZES:
-        pixel = (np.arange(size) * 2 + 1) * scene.train.masks.shape[1] // (2 * size)
         for every in EVERY:
-            train = scene.train[::every]
-            cameras, masks = train.cameras.resized(size, size), train.masks[:, pixel[:, None], pixel]
+            cameras, masks = scene.seen(size, every)
 
             def lift(cameras=cameras, masks=masks):
                 labels = lift_masks(scene.gaussians, cameras, masks, num_ids=scene.num_ids)
@@ -89,9 +87,7 @@ def descend(scene: Tabletop, starts: Iterable[tuple[float, float]], size: int = 
     The loss is the mean -log of the share of its soft votes that a Gaussian gives its true id, with a twentieth of a
     vote for every id, so that Gaussians without votes cost log(num_ids). Eight views of `size`² pixels.
     """
-    train = scene.train[::4]
-    pixel = (np.arange(size) * 2 + 1) * train.masks.shape[1] // (2 * size)
-    cameras, masks = train.cameras.resized(size, size), train.masks[:, pixel[:, None], pixel]
+    cameras, masks = scene.seen(size, every=4)
     config = enough_capacity(scene.gaussians, cameras, RenderConfig())
     rows = jnp.arange(len(scene.gaussians))
     optimizer = optax.adam(RATE)

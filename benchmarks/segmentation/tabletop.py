@@ -28,6 +28,12 @@ class Tabletop(NamedTuple):
     def num_ids(self) -> int:
         return max(self.names) + 1
 
+    def seen(self, size: int, every: int = 1, start: int = 0):
+        """Cameras and masks of some training views, with so many pixels along a side."""
+        train = self.train[start::every]
+        pixel = (np.arange(size) * 2 + 1) * train.masks.shape[1] // (2 * size)
+        return train.cameras.resized(size, size), train.masks[:, pixel[:, None], pixel]
+
 
 def load_tabletop(folder: Path | None = None) -> Tabletop:
     """Cloud on the depth maps and its views; without `folder` the bundled views and the cloud in tests/data."""

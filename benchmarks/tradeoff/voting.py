@@ -53,10 +53,7 @@ def study(options) -> str:
 
 
 def _vote(scene, every, size, start=0, **options):
-    train = scene.train[start::every]
-    pixel = (np.arange(size) * 2 + 1) * scene.train.masks.shape[1] // (2 * size)
-    cameras, masks = train.cameras.resized(size, size), train.masks[:, pixel[:, None], pixel]
-    gaussians = scene.gaussians
+    gaussians, (cameras, masks) = scene.gaussians, scene.seen(size, every, start)
     config = enough_capacity(gaussians, cameras, RenderConfig())
     vote = jax.jit(
         lambda gaussians, cameras: (

@@ -222,9 +222,8 @@ def plates():
             ours, exact = modulus(cells, axes=axes)
             errors.append(ours / exact - 1)
             what = "uniaxial" if axes == (2,) else "hydrostatic"
-            rows.append(
-                Row(f"plates, {what}, {cells} cells", name, f"{exact:.5g} Pa", f"{ours:.5g} Pa", percent(errors[-1]))
-            )
+            figures = f"{exact:.5g} Pa", f"{ours:.5g} Pa", percent(errors[-1])
+            rows.append(Row(f"plates, {what}, {cells} cells", name, *figures))
         series[name] = sizes, errors
 
     def draw(figure):

@@ -48,21 +48,14 @@ def dam_break():
         ours = np.interp(FRONT_T, T, Z)
         error = np.abs(ours / FRONT_Z - 1)
         name = f"dam break, {cells} cells wide"
-        rows.append(
-            Row(
-                f"{name}: front",
-                "Martin and Moyce 1952, table 2",
-                f"Z({FRONT_T[-1]}) = {FRONT_Z[-1]}",
-                f"{ours[-1]:.2f}",
-                f"mean {100 * error.mean():.1f} %, worst {100 * error.max():.1f} %",
-            )
-        )
+        figures = f"Z({FRONT_T[-1]}) = {FRONT_Z[-1]}", f"{ours[-1]:.2f}"
+        errors = f"mean {100 * error.mean():.1f} %, worst {100 * error.max():.1f} %"
+        rows.append(Row(f"{name}: front", "Martin and Moyce 1952, table 2", *figures, errors))
         speed = np.polyfit(FRONT_T[FRONT_Z > 2], FRONT_Z[FRONT_Z > 2], 1)[0]
         part = (Z > 2) & (Z < 4.11)
         own = np.polyfit(T[part], Z[part], 1)[0]
-        rows.append(
-            Row(f"{name}: speed", "same, slope for Z > 2", f"{speed:.3f}", f"{own:.3f}", percent(own / speed - 1))
-        )
+        figures = f"{speed:.3f}", f"{own:.3f}", percent(own / speed - 1)
+        rows.append(Row(f"{name}: speed", "same, slope for Z > 2", *figures))
 
     def draw(figure):
         front_axes, water = figure.subplots(2, 1, height_ratios=(3, 1))
@@ -149,10 +142,8 @@ def sand_cylinder():
     case = _columns("sand cylinder", [(1.0, cells) for cells in studies], axisymmetric=True)
     (coarse, fine), expected = (float(row.ours) for row in case.rows), lube(1.0, True)
     limit = fine + (fine - coarse) * studies[0] / (studies[1] - studies[0])
-    estimate = percent(limit / expected - 1)
-    case.rows.append(
-        Row("sand cylinder, extrapolated", "Lube et al. 2004", f"{expected:.2f}", f"{limit:.2f}", estimate)
-    )
+    figures = f"{expected:.2f}", f"{limit:.2f}", percent(limit / expected - 1)
+    case.rows.append(Row("sand cylinder, extrapolated", "Lube et al. 2004", *figures))
     return case
 
 

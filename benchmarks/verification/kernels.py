@@ -86,16 +86,9 @@ def kernels():
         rows.append(Row(f"ringing bar, {kernel}", "energy conserved", "1", f"{kept:.4f}", f"{100 * (kept - 1):+.1f} %"))
     for kernel in KERNELS:
         kept, drift = in_float64(turning)(kernel)
-        rows.append(
-            Row(
-                f"turning block, {kernel}: kinetic energy",
-                "conserved",
-                "1",
-                f"{kept:.4f}",
-                f"{100 * (kept - 1):+.1f} %",
-            )
-        )
-        rows.append(Row(f"turning block, {kernel}: angular momentum", "conserved", "0", f"{drift:.0e}", f"{drift:.0e}"))
+        name = f"turning block, {kernel}"
+        rows.append(Row(f"{name}: kinetic energy", "conserved", "1", f"{kept:.4f}", f"{100 * (kept - 1):+.1f} %"))
+        rows.append(Row(f"{name}: angular momentum", "conserved", "0", f"{drift:.0e}", f"{drift:.0e}"))
     for kernel, run in in_turn({kernel: substeps(kernel) for kernel in KERNELS}).items():
         rows.append(Row(f"time of a substep, {kernel}", "", "", f"{1e3 * run.seconds / STEPS:.2f} ms", ""))
 
