@@ -5,11 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.baselines.training import draw
 from pigjax.core.camera import Camera
 from pigjax.io import Views
 from pigjax.splat import Gaussians
-
-from .training import draw
 
 
 def choose(gaussians: Gaussians, candidates: np.ndarray, views: Views) -> tuple[np.ndarray, dict[int, int]]:

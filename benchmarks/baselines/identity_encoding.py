@@ -15,11 +15,10 @@ import numpy as np
 import optax
 from scipy.spatial import cKDTree
 
+from benchmarks.baselines.training import Fitted, draw, fit
 from pigjax.core.camera import Camera
 from pigjax.io import Views
 from pigjax.splat import Gaussians
-
-from .training import Fitted, draw, fit
 
 WIDTH = 16
 FEATURE_RATE, CLASSIFIER_RATE = 2.5e-2, 5e-3  # of Adam at the start

@@ -8,7 +8,7 @@ filling is ours in place of its opacity field, and so is the MPM core.
 
 import numpy as np
 
-from .box_selection import bounding_box, in_box
+from benchmarks.baselines.box_selection import bounding_box, in_box
 
 
 def ids_in_boxes(means: np.ndarray, object_id: np.ndarray, moving, margin: float = 0.0) -> np.ndarray:

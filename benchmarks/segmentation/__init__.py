@@ -1,1 +1,1 @@
-"""Studies of segmentation, one module each: `bench_segmentation.py` prints docs/results/SEGMENTATION.md."""
+"""Studies of segmentation, one module each."""

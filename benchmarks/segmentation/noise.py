@@ -1,17 +1,15 @@
-"""How much wrong the masks may be: what the vote makes of eroded, swapped, missing and salted ones."""
+"""Votes on masks that are eroded, swapped, missing or salted, by the amount."""
 
 from pathlib import Path
 
 import jax.numpy as jnp
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from benchmarks.common.pages import picture, table
+from benchmarks.segmentation.tabletop import TABLE, Tabletop, mean_scores, scores_by_object
 from pigjax.segmentation import Labels, fill_unseen, lift_masks
-from segmentation.tabletop import TABLE, Tabletop, mean_scores, scores_by_object
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 WEIGHTINGS = ("centre", "alpha")
 PLOT = "segmentation_noise.png"
@@ -64,17 +62,14 @@ NOISES = {
 }
 
 
-def study(scene: Tabletop, folder: Path) -> str:
-    """A table in Markdown, and its plot in `folder`.
+def study(scene: Tabletop, options) -> str:
+    """A table in Markdown, and its plot.
 
     Right is the share of Gaussians with their true id as the vote gives it; for mIoU on the test views (objects drawn
     alone, mean without the table) the unlabelled ones take the id of their neighbours.
     """
     assert scene.truth is not None
-    rows = [
-        "| noise | amount | right, centre | right, alpha | mIoU, centre | mIoU, alpha |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = []
     clean = np.asarray(scene.train.masks)
     results: dict[bytes, tuple[float, float]] = {}
     curves = {}
@@ -88,10 +83,12 @@ def study(scene: Tabletop, folder: Path) -> str:
                     results[key] = _score(scene, masks, weighting)
                 scores.append(results[key])
             (right, iou), (alpha_right, alpha_iou) = scores[-2:]
-            rows.append(f"| {name} | {amount} | {right:.4f} | {alpha_right:.4f} | {iou:.1f} | {alpha_iou:.1f} |")
+            numbers = f"{right:.4f}", f"{alpha_right:.4f}", f"{iou:.1f}", f"{alpha_iou:.1f}"
+            rows.append([name, amount, *numbers])
         curves[name] = amounts, np.reshape(scores, (len(amounts), 2, 2))
-    _plot(curves, folder / PLOT)
-    return "\n".join(rows)
+    _plot(curves, options.media / PLOT)
+    columns = ["noise", "amount", "right, centre", "right, alpha", "mIoU, centre", "mIoU, alpha"]
+    return f"{table(columns, rows)}\n\n{picture(PLOT, 'accuracy against noise')}"
 
 
 def _score(scene: Tabletop, masks, weighting: str) -> tuple[float, float]:

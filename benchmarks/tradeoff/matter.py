@@ -1,15 +1,16 @@
 """Matter: displacement error of the Gaussians' particles against the finest grid, over the simulation's knobs."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from tradeoff.errors import displacement_error, distance_travelled
-from tradeoff.points import Point, in_turn, plot, table
-from tradeoff.scenes import as_float64, simulate, source, tracers
+from benchmarks.common.pages import picture
+from benchmarks.common.timing import in_turn
+from benchmarks.tradeoff.errors import displacement_error, distance_travelled
+from benchmarks.tradeoff.points import Point, plot, table
+from benchmarks.tradeoff.scenes import as_float64, simulate, source, tracers
 
 PLOT = "tradeoff_matter.png"
 KNOBS = {
@@ -36,15 +37,15 @@ KNOBS["sand"] = KNOBS["elastic"]
 COARSER = {"elastic": "dx / 1.4", "sand": "dx / 1.4", "tabletop": "standard"}
 
 
-def study(folder: Path, scenes) -> str:
-    """Tables of all scenes, printed as they come, and one plot in `folder`."""
+def study(options) -> str:
+    """Tables of all scenes, printed as they come, and one plot."""
     panels, floors = {}, {}
-    for name in scenes:
+    for name in options.scenes:
         jax.clear_caches()  # compiled programs are mapped into memory piece by piece, and the pieces have a limit
         panels[name], floors[name], said = _study(name)
         print(f"**{name}**\n\n{said}\n\n{table(panels[name], error='error of the distance travelled')}\n")
-    plot(panels, folder / PLOT, error="displacement error (share of the distance)", floors=floors)
-    return f"![error against time of matter](../media/{PLOT})"
+    plot(panels, options.media / PLOT, error="displacement error (share of the distance)", floors=floors)
+    return picture(PLOT, "error against time of matter")
 
 
 def _study(name):

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.common.pages import TABLETOP
 from pigjax import Gaussians, save_ply
 from pigjax.core.camera import Camera
 from pigjax.coupling.binding import deform
@@ -22,7 +23,6 @@ from pigjax.scene.schema import Scene
 from pigjax.segmentation import Labels
 from pigjax.splat import RenderConfig, Splats, render
 
-EXAMPLE = Path(__file__).parents[2] / "examples/tabletop"
 SIDE, HEIGHT = 0.2, 0.24  # of the cube, and of its middle above the floor [m]
 
 
@@ -48,7 +48,7 @@ class Source(NamedTuple):
 def source(name: str) -> Source:
     """One of SCENES."""
     if name == "tabletop":
-        values, folder = tomllib.loads((EXAMPLE / "scene.toml").read_text()), EXAMPLE
+        values, folder = tomllib.loads((TABLETOP / "scene.toml").read_text()), TABLETOP
         values["simulation"] |= {"frames": 12}
     else:
         folder = Path(tempfile.mkdtemp())

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pigjax.mls_mpm import rollout
 from pigjax.mpm import Grid, make_particles
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.materials import Material, material_table
@@ -67,6 +68,15 @@ def particles(x, *, volume, table, v=None, C=None, F=None, body=0):
         if value is not None:
             made = eqx.tree_at(lambda p, name=name: getattr(p, name), made, jnp.asarray(value, float))
     return made
+
+
+def simulate(p, grid, table, config, *, frames, frame_dt, gravity=NO_GRAVITY, colliders=(), contact=None):
+    """Last state and path of a healthy rollout."""
+    end, path, health = rollout(
+        p, grid, table, config, frames=frames, frame_dt=frame_dt, gravity=gravity, colliders=colliders, contact=contact
+    )
+    health.raise_if_bad()
+    return end, path
 
 
 def kinetic(mass, v):

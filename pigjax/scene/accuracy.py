@@ -1,4 +1,4 @@
-"""Speed against accuracy in one word: `draft`, `standard` or `reference`, chosen by benchmarks/bench_tradeoff.py."""
+"""Speed against accuracy in one word: `draft`, `standard` or `reference`, chosen by benchmarks/tradeoff."""
 
 from __future__ import annotations
 

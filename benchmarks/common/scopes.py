@@ -15,6 +15,9 @@ def seconds_by_scope(compiled, run, scopes) -> dict[str, float]:
     name count for their caller. The profiler itself slows programs of small operations: compare the shares.
     """
     name_of = dict(re.findall(r'%?([\w.\-]+) = [^\n]*?op_name="([^"]*)"', compiled.as_text()))
+    found = {part for name in name_of.values() for part in name.split("/")}
+    if missing := [scope for scope in scopes if scope not in found]:
+        raise ValueError(f"no operation of the program is in scope {', '.join(missing)}")
 
     def scope(operation):
         parts = [part for part in name_of.get(operation, "").split("/") if part in scopes]

@@ -1,13 +1,12 @@
-"""Damage valid files of every kind that pigjax reads, and see that it reads them or answers with its own error.
+"""Damaged files of every kind that pigjax reads: it reads them or answers with its own error.
 
-    python benchmarks/fuzz.py --count 20000
-    python benchmarks/fuzz.py --seed 0 --only table.npz:17 --keep one    # one input again, and its files
+    python -m benchmarks fuzz --count 20000
+    python -m benchmarks fuzz --seed 0 --only table.npz:17 --keep one    # one input again, and its files
 
 A child process reads, with bounds on memory and time. A reader fails by an exception that is no InputError, by asking
 for more memory than the bound, by taking too long, or by ending the process. Same seed, same inputs.
 """
 
-import argparse
 import json
 import os
 import queue
@@ -22,6 +21,12 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+
+from benchmarks.common.command import start_worker
+from benchmarks.common.pages import head, row
+from benchmarks.fuzz.damage import damaged
+from benchmarks.fuzz.readers import READERS
+from pigjax.core.errors import InputError
 
 SECONDS = 10.0  # for one input
 START_SECONDS = 300.0  # to import, to write the valid files and to read them once
@@ -46,8 +51,6 @@ def fuzz(count, seed=0, readers=None, tell=print):
 
 
 def _jobs(count, names):
-    from _readers import READERS
-
     chosen = {name: reader for name, reader in READERS.items() if names is None or name in names}
     total = sum(reader.share for reader in chosen.values())
     jobs = []
@@ -62,8 +65,7 @@ def _child(jobs, at, seed, folder, counts, failures, tell):
     folder.mkdir()
     listing = folder / "jobs.json"
     listing.write_text(json.dumps(jobs[at:]))
-    command = [sys.executable, __file__, "--child", str(listing), "--seed", str(seed)]
-    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    child = start_worker("fuzz", listing, seed, stderr=subprocess.PIPE)
     lines, said = queue.Queue(), []
     threading.Thread(target=lambda: [*map(lines.put, child.stdout), lines.put(None)], daemon=True).start()
     errors = threading.Thread(target=lambda: said.extend(child.stderr), daemon=True)
@@ -105,15 +107,14 @@ def _child(jobs, at, seed, folder, counts, failures, tell):
     return at
 
 
-def _read_all(listing, seed):
+def worker(listing, seed):
     """The child: reads each job, and prints a line before the first and after each."""
+    listing, seed = Path(listing), int(seed)
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
 
     def tell(**what):
         print(json.dumps(what), file=out, flush=True)
-
-    from _readers import READERS
 
     warnings.simplefilter("ignore")
     jobs = json.loads(listing.read_text())
@@ -150,11 +151,7 @@ def _bound_memory():
 
 def _read_one(reader, folder, rng, others):
     """Damage a file of the folder, read, and put the file back."""
-    from _damage import damaged
-
-    from pigjax.core.errors import InputError
-
-    file, change = _damage_of(reader, folder, rng, others, damaged)
+    file, change = _damage_of(reader, folder, rng, others)
     before = file.read_bytes()
     try:
         _put(file, change)
@@ -172,7 +169,7 @@ def _read_one(reader, folder, rng, others):
         file.write_bytes(before)
 
 
-def _damage_of(reader, folder, rng, others, damaged):
+def _damage_of(reader, folder, rng, others):
     files = sorted(path for path in folder.glob(reader.files) if path.is_file())
     file = files[rng.integers(len(files))]
     return file, damaged(file.name, file.read_bytes(), rng, others)
@@ -195,45 +192,36 @@ def _names_memory(error):
 
 
 def _again(which, seed, keep):
-    """One input anew in this process, with its traceback; its files stay in the folder `keep`."""
-    from _damage import damaged
-    from _readers import READERS
-
+    """One input once more in this process, with its traceback; its files stay in the folder `keep`."""
     name, _, number = which.rpartition(":")
     keep.mkdir(parents=True)
     READERS[name].write(keep)
     if number != "valid":
         others = [path.read_bytes() for path in sorted(keep.glob("**/*")) if path.is_file()]
-        file, change = _damage_of(READERS[name], keep, _generator(seed, name, int(number)), others, damaged)
+        file, change = _damage_of(READERS[name], keep, _generator(seed, name, int(number)), others)
         print(f"damaged: {file}")
         _put(file, change)
     print(READERS[name].read(keep))
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--readers", nargs="*", help="names of readers; all if not given")
-    parser.add_argument("--only", help="READER:NUMBER, as a failure was printed")
-    parser.add_argument("--keep", type=Path, help="with --only: a new folder for the damaged files")
-    parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.child:
-        _read_all(arguments.child, arguments.seed)
+def study(options):
+    """Print the counts of each reader; ends the process with 1 where one failed."""
+    if options.only:
+        _again(options.only, options.seed, options.keep or Path(tempfile.mkdtemp()) / "input")
         return
-    if arguments.only:
-        keep = arguments.keep or Path(tempfile.mkdtemp()) / "input"
-        _again(arguments.only, arguments.seed, keep)
-        return
-    counts, failures = fuzz(arguments.count, arguments.seed, arguments.readers)
-    print(f"{'reader':28s}   read  refused  failed")
-    for name, found in counts.items():
-        print(f"{name:28s} {found['read']:6d} {found['refused']:8d} {found['failed']:7d}")
-    total = sum(counts.values(), Counter())
-    print(f"{'all':28s} {total['read']:6d} {total['refused']:8d} {total['failed']:7d}")
-    sys.exit(bool(failures))
+    counts, failures = fuzz(options.count, options.seed, options.readers)
+    print(head("reader", "read", "refused", "failed"))
+    for name, found in {**counts, "all": sum(counts.values(), Counter())}.items():
+        print(row(name, found["read"], found["refused"], found["failed"]))
+    if failures:
+        sys.exit(1)
 
 
-if __name__ == "__main__":
-    main()
+PARTS = {"readers": ("Damaged files", study)}
+OPTIONS = {
+    "count": {"type": int, "default": 2000, "help": "inputs, shared among the readers"},
+    "seed": {"type": int, "default": 0, "help": "of the damage"},
+    "readers": {"nargs": "*", "choices": READERS, "help": "names of readers; all if not given"},
+    "only": {"help": "READER:NUMBER, as a failure was printed"},
+    "keep": {"type": Path, "help": "with --only: a new folder for the damaged files"},
+}

@@ -1,28 +1,25 @@
-"""Control through contact: python benchmarks/bench_control.py [throw miss cost]
+"""Control through contact: a throw that knocks a cube off the table, found with and without gradients.
 
-The throw of a ball is sought that knocks a cube off the table (examples/studies/knock_off.toml), by the gradients of
-MLS-MPM through the contact on the grid, and without gradients. `--write docs/results/CONTROL.md` replaces the
-sections that were run.
+The throw of a ball is sought (examples/studies/knock_off.toml) by the gradients of MLS-MPM through the contact on the
+grid, and without gradients.
 """
 
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _pages import run_parts
-from _timing import measure, use_host_devices
 
+from benchmarks.common.pages import EXAMPLES, head, picture, row
+from benchmarks.common.timing import measure
 from pigjax import io
 from pigjax.study import experiment, load_study
 from pigjax.study.objectives import objective_of
 from pigjax.study.optimize import Bounds, fit, search
 
-STUDIES = Path(__file__).parents[1] / "examples" / "studies"
-MEDIA = Path(__file__).parents[1] / "docs" / "media"
+STUDIES = EXAMPLES / "studies"
 THROW = "objects.soccerball.velocity"
 EDGE = -0.39  # of the table [m]
 OFF = EDGE - 0.02  # a middle of the cube that is off [m]
@@ -31,7 +28,7 @@ WEAK = [0.1, -1.2, 0.3]  # reaches the cube and leaves it on the table
 WIDE = [-0.8, -0.8, 0.2]  # passes it
 HARD = [0.2, -2.5, 0.5]  # knocks it far off
 STEPS, EVALUATIONS = 40, 112
-HEADER = "| throw | velocity [m/s] | cube at the end: y [m] | z [m] | off |\n|---|---|---|---|---|"
+HEADER = head("throw", "velocity [m/s]", "cube at the end: y [m]", "z [m]", "off")
 
 
 @cache
@@ -65,12 +62,12 @@ def ending(values, made):
     return scores_of(outcome), outcome.experiment.video(outcome.trajectory)
 
 
-def row(name, values):
-    """A line of the table; gives the frames."""
+def print_row(name, values):
+    """Print a line of the table; gives the frames."""
     where, frames = ending(values, prepared()[0])
     y, z = float(where["y"]), float(where["z"])
     velocity = ", ".join(f"{v:.2f}" for v in np.asarray(values[THROW]))
-    print(f"| {name} | {velocity} | {y:.3f} | {z:.3f} | {'yes' if y < OFF else 'no'} |")
+    print(row(name, velocity, f"{y:.3f}", f"{z:.3f}", "yes" if y < OFF else "no"))
     return np.asarray(frames)
 
 
@@ -83,19 +80,19 @@ def descend(velocity):
     )  # fmt: skip
 
 
-def throw() -> None:
+def throw(options) -> str:
     start = start_of(WEAK)
     best, history = descend(WEAK)
     print(f"The table's edge is at y = {EDGE} m. Descent stops at the first throw that pushes the cube past it.\n")
     print(HEADER)
-    rows = [row("start", start), row("found", best)]
+    rows = [print_row("start", start), print_row("found", best)]
     print(f"\nLoss {history.loss[0]:.3g} to {history.least:.2g} m² in {len(history)} gradients.")
     frames = [frame for frames in rows for frame in frames[1::2]]
-    io.write_image(MEDIA / "control_throw.png", io.contact_sheet(frames, columns=len(frames) // 2))
-    print("\n![Above the start, below what was found, every second frame](../media/control_throw.png)")
+    io.write_image(options.media / "control_throw.png", io.contact_sheet(frames, columns=len(frames) // 2))
+    return "\n" + picture("control_throw.png", "Above the start, below the throw found, every second frame")
 
 
-def miss() -> None:
+def miss(_) -> None:
     made, _ = prepared()
     slope = jax.jit(lambda values, shared: jax.grad(loss, has_aux=True)(values, shared)[0])
     for name, velocity in (("touches the cube", WEAK), ("misses it", WIDE)):
@@ -103,28 +100,28 @@ def miss() -> None:
         print(f"Slope [m²/(m/s)] at a throw that {name}: {steep[0]:.1e} alone, {steep[1]:.1e} with the nearest pass.\n")
     best, history = descend(WIDE)
     print(HEADER)
-    row("start", start_of(WIDE))
-    row("found, with the pass", best)
+    print_row("start", start_of(WIDE))
+    print_row("found, with the pass", best)
     print(f"\n{len(history)} gradients.")
 
 
-def cost() -> None:
+def cost(_) -> None:
     made, bounds = prepared()
     shared = made, jnp.asarray(0.3)
-    _, once, _ = measure(loss, start_of(WEAK), shared, repeats=3)
+    once = measure(loss, start_of(WEAK), shared, windows=3).seconds
     print(f"One loss takes {once:.2f} s. Until the cube is off, compilation apart:\n")
-    print("| start | way | losses | gradients | s | off |\n|---|---|---|---|---|---|")
+    print(head("start", "method", "losses", "gradients", "s", "off"))
     for name, velocity in (("touches the cube", WEAK), ("misses it", WIDE)):
         _, history = descend(velocity)
         off = "yes" if history.scores["y"][-1] < OFF else "no"
         each = float(np.median(np.diff(history.seconds)))
-        print(f"| {name} | Adam | 0 | {len(history)} | {len(history) * each:.0f} | {off} |")
+        print(row(name, "Adam", 0, len(history), f"{len(history) * each:.0f}", off))
         _, history = search(
             lambda values, shared: loss(values, shared)[0], start_of(velocity), evaluations=EVALUATIONS, bounds=bounds,
             shared=shared, callback=lambda step: step.loss < (OFF - WANTED) ** 2,
         )  # fmt: skip
         off = "yes" if history.least < (OFF - WANTED) ** 2 else "no"
-        print(f"| {name} | CMA-ES | {len(history)} | 0 | {len(history) * once:.0f} | {off} |")
+        print(row(name, "CMA-ES", len(history), 0, f"{len(history) * once:.0f}", off))
 
 
 PARTS = {
@@ -132,7 +129,4 @@ PARTS = {
     "miss": ("From a throw that misses", miss),
     "cost": ("What it costs, beside a search without gradients", cost),
 }
-
-if __name__ == "__main__":
-    use_host_devices()
-    run_parts("bench_control.py", "Control through contact", PARTS, __doc__)
+DEVICES = None

@@ -1,56 +1,54 @@
-"""Clips of examples/materials and one sheet of them: `python benchmarks/make_gallery.py [jelly sand ...] [-o FOLDER]`.
+"""Pictures of the README: clips of examples/materials side by side, and of the bundled tabletop.
 
-Each scene leaves what `pigjax run` leaves in FOLDER/<name>, and one line with its seconds. When every scene has a clip,
-docs/media/materials.png (a row of pictures for each) and docs/media/materials.gif (all clips side by side) are written.
+Each scene leaves its results as `pigjax run` does in `--out`/NAME. When every material has a clip, materials.png (a row
+of pictures for each) and materials.gif (all clips side by side) are drawn.
 """
 
-import argparse
-import time
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 from PIL import Image, ImageDraw
 
-from pigjax.cli import one_device_per_core
+from benchmarks.common.pages import EXAMPLES, ROOT, TABLETOP, head, row
+from benchmarks.common.timing import clock
+from pigjax import write_video
 from pigjax.scene import load_scene, run_scene
 
-ROOT = Path(__file__).parents[1]
-SCENES = {path.stem: path for path in sorted((ROOT / "examples" / "materials").glob("*.toml"))}
+SCENES = {path.stem: path for path in sorted((EXAMPLES / "materials").glob("*.toml"))}
 SHEET, TILE = (6, (184, 138)), (208, 156)  # pictures a clip and their size; size in the animation
 PLAYED = 28  # pictures of the animation
+HEADER = head("scene", "s", "stages: run + compile [s]", "particles", "frames", "substeps", "least J", "notes")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"some of {', '.join(SCENES)}; all if none is given")
-    parser.add_argument("-o", "--out", type=Path, default=ROOT / "out" / "materials")
-    arguments = parser.parse_args()
-    if unknown := set(arguments.names) - set(SCENES):
-        parser.error(f"no scene of the name {', '.join(sorted(unknown))}: choose from {', '.join(SCENES)}")
-    one_device_per_core()
-    for name in arguments.names or SCENES:
-        print(run(name, arguments.out / name), flush=True)
-    clips = {name: arguments.out / name / "video.mp4" for name in SCENES}
+def materials(options) -> None:
+    """Run the scenes of the materials, and draw the sheet and the animation."""
+    print(HEADER)
+    for name in options.scenes:
+        print(run(SCENES[name], options.out / name))
+    clips = {name: options.out / name / "video.mp4" for name in SCENES}
     if all(clip.is_file() for clip in clips.values()):
         pictures = {name: iio.imread(clip) for name, clip in clips.items()}
-        write_sheet(pictures, ROOT / "docs" / "media" / "materials.png")
-        write_animation(pictures, ROOT / "docs" / "media" / "materials.gif")
+        write_sheet(pictures, options.media / "materials.png")
+        write_animation(pictures, options.media / "materials.gif")
 
 
-def run(name: str, folder: Path) -> str:
-    start, worked = time.perf_counter(), time.process_time()
-    report = run_scene(load_scene(SCENES[name]), folder)
-    took, worked = time.perf_counter() - start, time.process_time() - worked
+def tabletop(options) -> None:
+    """Run the demo's scene, and draw it small."""
+    print(HEADER)
+    print(run(TABLETOP / "scene.toml", options.out / "tabletop"))
+    frames = iio.imread(options.out / "tabletop" / "video.mp4")
+    small = [np.asarray(Image.fromarray(frame).resize((360, 270))) for frame in frames]
+    write_video(options.media / "tabletop.gif", small, fps=12)
+
+
+def run(scene: Path, folder: Path) -> str:
+    """Run a scene into a folder; a line of the table."""
+    seconds, report = clock(lambda: run_scene(load_scene(scene), folder))
     stages = ", ".join(f"{stage} {spent.run:.1f} + {spent.compile:.1f}" for stage, spent in report.times.items())
-    sizes = report.sizes
-    told = (
-        f"{name:11s} {took:5.1f} s, {worked:.1f} s of CPU ({stages}; run + compile)",
-        f"{sizes['particles']} particles, {sizes['frames']} frames of {sizes['substeps_per_frame']} substeps",
-        *(f"J ≥ {report.health[key]:.3f}" for key in ("min_J",) if key in report.health),
-        *(f"note: {warning}" for warning in report.warnings),
-    )
-    return "\n    ".join(told)
+    sizes = [report.sizes[name] for name in ("particles", "frames", "substeps_per_frame")]
+    least = f"{report.health['min_J']:.3f}" if "min_J" in report.health else ""
+    return row(folder.name, f"{seconds:.1f}", stages, *sizes, least, "; ".join(report.warnings))
 
 
 def write_sheet(clips: dict[str, np.ndarray], path: Path) -> None:
@@ -102,5 +100,9 @@ def label(page: Image.Image, name: str, at: tuple[int, int]) -> None:
     ImageDraw.Draw(page).text(at, name.replace("_", " "), fill="black", stroke_width=2, stroke_fill="white")
 
 
-if __name__ == "__main__":
-    main()
+PARTS = {"materials": ("Materials", materials), "tabletop": ("Tabletop", tabletop)}
+OPTIONS = {
+    "scenes": {"nargs": "+", "default": list(SCENES), "choices": SCENES, "help": "of part materials"},
+    "out": {"type": Path, "default": ROOT / "out" / "materials", "help": "folder of all results"},
+}
+DEVICES = None

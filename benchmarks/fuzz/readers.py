@@ -1,6 +1,5 @@
 """Every reader of pigjax with a small valid input: `write(folder)` makes the files, `read(folder)` reads them."""
 
-import importlib
 import json
 import warnings
 from collections.abc import Callable
@@ -31,17 +30,6 @@ class Reader(NamedTuple):
     read: Callable[[Path], Any]
     files: str = "*"  # which files are damaged, a pattern
     share: int = 10  # of the inputs, relative to the others
-
-
-def _found(*places: str) -> Any:
-    """The first of these functions ("module:name") that this version has."""
-    for place in places:
-        module, name = place.split(":")
-        try:
-            return getattr(importlib.import_module(module), name)
-        except (ImportError, AttributeError):
-            continue
-    return None
 
 
 # Gaussians and points
@@ -339,8 +327,7 @@ def _study(folder: Path) -> None:
 
 def _read_study(folder: Path) -> Any:
     study = load_study(folder / "study.toml")
-    read = getattr(study, "load_scene", None) or getattr(study, "to_scene", None)
-    return study, read() if callable(read) else None
+    return study, study.to_scene()
 
 
 def _state(folder: Path) -> None:
@@ -377,8 +364,7 @@ def _labels(folder: Path) -> None:
 
 
 def _read_labels(folder: Path) -> Any:
-    read = _found("pigjax.io:load_labels", "pigjax.io.labels:load_labels", "pigjax.cli.evaluating:_read_labels")
-    return read(folder / "labels.npz", 4)
+    return io.load_labels(folder / "labels.npz", 4)
 
 
 def _table(folder: Path) -> None:
@@ -437,9 +423,7 @@ READERS: dict[str, Reader] = {
     "dataset.lerf-mask": Reader(_lerf, lambda at: io.load_dataset(at, "lerf-mask"), "**/*", 10),
     "dataset.3d-ovs": Reader(_ovs, lambda at: io.load_dataset(at, "3d-ovs"), "**/*", 10),
     "dataset.views": Reader(_labelled, lambda at: io.load_dataset(at, "views"), "**/*", 10),
-    "names.json": Reader(
-        _json_file({"1": "cup", "2": "lid"}), lambda at: _found("pigjax.io.datasets:load_names")(_only(at))
-    ),
+    "names.json": Reader(_json_file({"1": "cup", "2": "lid"}), lambda at: io.load_names(_only(at))),
     "report.json": Reader(
         _json_file({"psnr": {"a": 1.5}, "files": ["x"]}), lambda at: io.read_json(_only(at)), share=5
     ),

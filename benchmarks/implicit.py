@@ -1,20 +1,18 @@
-"""Explicit against implicit steps over Young's modulus: `python benchmarks/bench_implicit.py [--young 1e3 ...]`.
+"""Explicit against implicit steps over Young's modulus: time and error.
 
 A block of 5 cells a side is thrown at 1 m/s along a frictional floor and settles on it, for 0.1 s in frames of 1/40 s.
 Errors are the farthest particle's, relative to the longest way, against explicit float64 steps of half the stable
 length. Seconds are per simulated second, warm, on one device.
 """
 
-import argparse
 import math
-import os
-import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _timing import machine
 
+from benchmarks.common.pages import head, row
+from benchmarks.common.timing import timed
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, make_particles
 from pigjax.mpm.colliders import Plane
@@ -36,47 +34,37 @@ def block(young, dtype):
     return particles, Grid(jnp.zeros(3, dtype), jnp.asarray(DX, dtype), (24, 16, 16)), table, floor
 
 
-def run(young, dtype, **config):
-    """End, start, seconds of a warm run, substeps per frame and health."""
+def run(young, dtype, windows=3, **config):
+    """End, start, seconds of warm runs, substeps per frame and health."""
     particles, grid, table, floor = block(young, dtype)
     settings = SimConfig(devices=1, **config)
-
-    def once():
-        steps = {"frames": FRAMES, "frame_dt": FRAME_DT, "gravity": GRAVITY, "colliders": (floor,)}
-        return jax.block_until_ready(rollout(particles, grid, table, settings, **steps))
-
-    once()
-    begun = time.perf_counter()
-    end, _, health = once()
-    return end.x, particles.x, time.perf_counter() - begun, int(health.substeps), health
+    steps = {"frames": FRAMES, "frame_dt": FRAME_DT, "gravity": GRAVITY, "colliders": (floor,)}
+    found = timed(lambda: rollout(particles, grid, table, settings, **steps), windows)
+    end, _, health = found.result
+    return end.x, particles.x, found.seconds, int(health.substeps), health
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--young", nargs="+", type=float, default=[1e3, 1e5, 1e7, 1e8, 1e9])
-    parser.add_argument("--substeps", nargs="+", type=int, default=[1, 4, 16], help="implicit steps per frame")
-    arguments = parser.parse_args()
-    print(machine(), f"load {os.getloadavg()[0]:.1f}\n")
-    print("| E Pa | integrator | substeps per frame | s per simulated s | error | not converged | auto takes |")
-    print("|---|---|---|---|---|---|---|")
-    for young in arguments.young:
+def compare(options):
+    """Print explicit steps and implicit ones of several lengths, for each modulus."""
+    print(head("E Pa", "integrator", "substeps per frame", "s per simulated s", "error", "not converged", "auto takes"))
+    for young in options.young:
         with jax.enable_x64(True):
             particles, grid, table, floor = block(young, np.float64)
             steps = {"frames": FRAMES, "frame_dt": FRAME_DT, "gravity": GRAVITY, "colliders": (floor,)}
             stable = choose_substeps(particles, grid, table, SimConfig(), **steps)
             auto = choose_integrator(particles, grid, table, SimConfig(integrator="auto"), **steps).integrator
-            exact, start, *_ = run(young, np.float64, substeps=2 * stable)
+            exact, start, *_ = run(young, np.float64, windows=1, substeps=2 * stable)
             exact, way = np.asarray(exact), np.abs(exact - start).max()
-        for integrator, substeps in (("explicit", stable), *(("implicit", n) for n in arguments.substeps)):
+        for integrator, substeps in (("explicit", stable), *(("implicit", n) for n in options.substeps)):
             end, _, seconds, taken, health = run(young, np.float32, integrator=integrator, substeps=substeps)
             error = np.abs(np.asarray(end, np.float64) - exact).max() / way
             rate = seconds / (FRAMES * FRAME_DT)
-            print(
-                f"| {young:.0e} | {integrator} | {taken} | {rate:.2f} | {error:.1e} |"
-                f" {int(health.unconverged) if math.isfinite(error) else 'broke down'} | {auto} |",
-                flush=True,
-            )
+            unconverged = int(health.unconverged) if math.isfinite(error) else "broke down"
+            print(row(f"{young:.0e}", integrator, taken, f"{rate:.2f}", f"{error:.1e}", unconverged, auto))
 
 
-if __name__ == "__main__":
-    main()
+PARTS = {"stiffness": ("Explicit and implicit steps", compare)}
+OPTIONS = {
+    "young": {"nargs": "+", "type": float, "default": [1e3, 1e5, 1e7, 1e8, 1e9], "help": "moduli [Pa]"},
+    "substeps": {"nargs": "+", "type": int, "default": [1, 4, 16], "help": "implicit steps per frame"},
+}

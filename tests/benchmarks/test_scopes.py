@@ -2,7 +2,7 @@
 
 import collections
 
-from _profile import _add_own_times
+from benchmarks.common.scopes import _add_own_times
 
 
 def test_own_times_leave_out_what_is_called_and_count_for_the_nearest_scope():

@@ -1,14 +1,11 @@
-"""System identification from video: python benchmarks/bench_identification.py [one two field other cost video]
+"""System identification from video: stiffness and throw of the objects of a known simulation.
 
 A known simulation of the tabletop is drawn, then stiffness and throw are recovered from the video alone, through the
-gradients of render ∘ clamp ∘ MLS-MPM. `--write docs/results/IDENTIFICATION.md` replaces the sections that were run.
+gradients of render ∘ clamp ∘ MLS-MPM. Part video writes the frames that examples/studies/duck_from_video.toml fits.
 """
 
 from __future__ import annotations
 
-import resource
-import sys
-import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,16 +15,15 @@ import jax.numpy as jnp
 import msgspec
 import numpy as np
 import optax
-from _pages import run_parts
-from _timing import measure, use_host_devices
 
+from benchmarks.common.pages import EXAMPLES, ROOT, head, picture, row
+from benchmarks.common.timing import clock, measure
 from pigjax import io
 from pigjax.study import Experiment, experiment, load_study
 from pigjax.study.objectives import pyramid_error
 from pigjax.study.optimize import Bounds, fit, search
 
-STUDIES = Path(__file__).parents[1] / "examples" / "studies"
-MEDIA = Path(__file__).parents[1] / "docs" / "media"
+STUDIES = EXAMPLES / "studies"
 STIFF = Bounds(1e3, 4e4, "log")
 SPEED = Bounds(-4.0, 4.0)
 STEPS = 60
@@ -63,45 +59,43 @@ def bounds_of(values):
 def descend(made, target, start, *, bounds=None, steps=STEPS, rate=0.1, levels=1):
     """The fit, with a rate that falls to nothing, by the pictures at so many sizes."""
     adam = optax.adam(optax.cosine_decay_schedule(rate, steps))
-    begun = time.perf_counter()
-    best, history = fit(
-        partial(loss, levels=levels), arrays(start), adam, steps=steps, bounds=bounds or bounds_of(start),
-        shared=(made, target),
+    seconds, (best, history) = clock(
+        lambda: fit(partial(loss, levels=levels), arrays(start), adam, steps=steps, bounds=bounds or bounds_of(start),
+                    shared=(made, target))
     )  # fmt: skip
-    return best, history, time.perf_counter() - begun
+    return best, history, seconds
 
 
-def off(name, value, truth):
+def off(value, truth):
     """Error [%]: of vectors, the length of the difference."""
     value, truth = np.asarray(value, float), np.asarray(truth, float)
     return 100 * np.linalg.norm(value - truth) / np.linalg.norm(truth)
 
 
 def report(truth, start, best, history, seconds):
-    print("| parameter | truth | start | found | error |\n|---|---|---|---|---|")
+    print(head("parameter", "truth", "start", "found", "error"))
     for name, value in truth.items():
         shown = (
             np.round(np.asarray(v, float), 4 if np.ndim(v) else 1).tolist() for v in (value, start[name], best[name])
         )
-        print("| " + " | ".join((name, *map(str, shown), f"{off(name, best[name], value):.2f} %")) + " |")
+        print(row(name, *shown, f"{off(best[name], value):.2f} %"))
     each = float(np.median(np.diff(history.seconds)[3:]))
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(
         f"\nLoss {history.loss[0]:.3g} to {history.least:.2g} in {len(history)} gradients of {each:.2f} s,"
-        f" {seconds:.0f} s in all with compilation; peak memory of the process {peak:.1f} GB."
+        f" {seconds:.0f} s in all with compilation."
     )
 
 
-def one() -> None:
+def one(options) -> str:
     made = made_from(extremes=[{"objects.duck.young": STIFF.high}])
     target = film(arrays(DUCK), made)
     best, history, seconds = descend(made, target, DUCK_START, steps=80)
     report(DUCK, DUCK_START, best, history, seconds)
-    history.plot(MEDIA / "identification_one.png")
+    history.plot(options.media / "identification_one.png")
     rows = [np.asarray(film(arrays(values), made))[::2] for values in (DUCK, DUCK_START, best)]
     sheet = io.contact_sheet([frame for row in rows for frame in row], columns=len(rows[0]))
-    io.write_image(MEDIA / "identification_frames.png", sheet)
-    print("\n![Truth, start and what was found, every second frame](../media/identification_frames.png)")
+    io.write_image(options.media / "identification_frames.png", sheet)
+    return "\n" + picture("identification_frames.png", "Truth, start and result, every second frame")
 
 
 TWO = {
@@ -114,7 +108,7 @@ TWO_START = {
 }  # fmt: skip
 
 
-def two() -> None:
+def two(_) -> None:
     view = {"camera.target": [0.06, 0.10, 0.40], "camera.radius": 0.85, "camera.start": -40, "camera.width": 112}
     made = made_from(
         only=["table", "duck", "soccerball"], overrides=view, extremes=[{"objects.duck.young": STIFF.high}]
@@ -124,7 +118,7 @@ def two() -> None:
     report(TWO, TWO_START, best, history, seconds)
 
 
-def field() -> None:
+def field(_) -> None:
     parts = 3
     truth = {
         "objects.duck.young": [6e3, 1.2e4, 2.4e4],
@@ -138,7 +132,7 @@ def field() -> None:
     bounds = {"objects.duck.young": STIFF, "objects.duck.density": Bounds(300.0, 3000.0, "log")}
     best, history, seconds = descend(made, target, start, bounds=bounds, steps=70)
     report(truth, start, best, history, seconds)
-    # what the video says of each combination: J'J of the frames by the logarithms of the parameters
+    # how well the video determines each combination: JᵀJ of the frames by the logarithms of the parameters
     names = list(truth)
 
     def frames(logs):
@@ -150,16 +144,16 @@ def field() -> None:
         nudge = 0.02 * jax.nn.one_hot(k, len(logs))
         columns.append(np.asarray(frames(logs + nudge) - frames(logs - nudge)).ravel() / 0.04)
     weight, axes = np.linalg.eigh(np.array(columns) @ np.array(columns).T)
-    print("\nWhat the video says of directions in the logarithms of E and ρ of the parts, by the eigenvalues of JᵀJ:\n")
-    print("| eigenvalue, of the largest | direction |\n|---|---|")
+    print("\nDirections in the logarithms of E and ρ of the parts that the video determines, by eigenvalues of JᵀJ:\n")
+    print(head("eigenvalue, of the largest", "direction"))
     for value, axis in zip(weight[::-1], axes.T[::-1]):
-        print(f"| {value / weight[-1]:.1e} | {', '.join(f'{part:.2f}' for part in axis)} |")
+        print(row(f"{value / weight[-1]:.1e}", ", ".join(f"{part:.2f}" for part in axis)))
     ratio, wanted = (np.asarray(own[names[0]]) / np.asarray(own[names[1]]) for own in (best, truth))
     print(f"\nE/ρ of the parts is off by {', '.join(f'{100 * abs(r / w - 1):.1f}' for r, w in zip(ratio, wanted))} %.")
 
 
-def other() -> None:
-    print("| the video | E | v0 |\n|---|---|---|")
+def other(_) -> None:
+    print(head("the video", "E", "v0"))
     made = made_from(extremes=[{"objects.duck.young": STIFF.high}])
     clean = film(arrays(DUCK), made)
     rng = np.random.default_rng(0)
@@ -172,22 +166,21 @@ def other() -> None:
     }
     for name, target in videos.items():
         best, _, _ = descend(made, target, DUCK_START)
-        errors = [f"{off(key, best[key], DUCK[key]):.2f} %" for key in DUCK]
-        print(f"| {name} | {errors[0]} | {errors[1]} |", flush=True)
+        print(row(name, *errors_of(best)))
 
 
-def cost() -> None:
+def cost(_) -> None:
     made = made_from(extremes=[{"objects.duck.young": STIFF.high}])
     target = film(arrays(DUCK), made)
     start, shared = arrays(DUCK_START), (made, target)
     forward = jax.jit(loss)
     whole = replace(made, config=replace(made.config, box=None))
-    print("| grid | nodes | forward [s] | forward and backward [s] | compile [s] |\n|---|---|---|---|---|")
+    print(head("grid", "nodes", "forward [s]", "forward and backward [s]", "compile [s]"))
     for name, own in (("whole", whole), ("a box that moves", made)):
-        _, once, _ = measure(loss, start, (own, target))
-        compiling, both, _ = measure(jax.value_and_grad(loss), start, (own, target))
+        once = measure(loss, start, (own, target)).seconds
+        run = measure(jax.value_and_grad(loss), start, (own, target))
         nodes = "x".join(map(str, own.config.box or own.grid.shape))
-        print(f"| {name} | {nodes} | {once:.3f} | {both:.3f} | {compiling:.1f} |")
+        print(row(name, nodes, f"{once:.3f}", f"{run.seconds:.3f}", f"{run.compile_seconds:.1f}"))
     print()
     limits = bounds_of(start)
     names = sorted(start)
@@ -199,32 +192,31 @@ def cost() -> None:
 
     at = jnp.concatenate([jnp.ravel(limits[name].to_free(start[name])) for name in names])
     exact = jax.grad(lambda v: of_free(v))(at)
-    print("| way | in forward passes | angle to the exact gradient |\n|---|---|---|")
-    print(f"| reverse mode | {both / once:.1f} | 0 |")
+    print(head("gradient", "in forward passes", "angle to the exact gradient"))
+    print(row("reverse mode", f"{run.seconds / once:.1f}", 0))
     for h in (1e-1, 1e-2, 1e-3):
         central = jnp.stack([(of_free(at + h * e) - of_free(at - h * e)) / (2 * h) for e in jnp.eye(4)])
         cosine = float(central @ exact / jnp.linalg.norm(central) / jnp.linalg.norm(exact))
-        print(f"| central differences, h = {h:g} | {2 * len(at)} | {np.degrees(np.arccos(min(cosine, 1.0))):.2f}° |")
-    print("\n| way | losses | gradients | s | E | v0 |\n|---|---|---|---|---|---|")
+        angle = np.degrees(np.arccos(min(cosine, 1.0)))
+        print(row(f"central differences, h = {h:g}", 2 * len(at), f"{angle:.2f}°"))
+    print("\n" + head("method", "losses", "gradients", "s", "E", "v0"))
     best, history, seconds = descend(made, target, DUCK_START)
-    print(f"| Adam | 0 | {len(history)} | {seconds:.0f} | " + errors_of(best))
-    for evaluations in (240,):
-        begun = time.perf_counter()
-        best, history = search(loss, start, evaluations=evaluations, bounds=limits, shared=shared)
-        print(f"| CMA-ES | {len(history)} | 0 | {time.perf_counter() - begun:.0f} | " + errors_of(best), flush=True)
+    print(row("Adam", 0, len(history), f"{seconds:.0f}", *errors_of(best)))
+    seconds, (best, history) = clock(lambda: search(loss, start, evaluations=240, bounds=limits, shared=shared))
+    print(row("CMA-ES", len(history), 0, f"{seconds:.0f}", *errors_of(best)))
 
 
-def errors_of(best) -> str:
-    return " | ".join(f"{off(name, best[name], DUCK[name]):.2f} %" for name in DUCK) + " |"
+def errors_of(best) -> list[str]:
+    return [f"{off(best[name], DUCK[name]):.2f} %" for name in DUCK]
 
 
-def video() -> None:
-    """Write the frames that examples/studies/duck_from_video.toml looks for."""
+def video(options) -> str:
+    """Write the frames that examples/studies/duck_from_video.toml fits."""
     made = made_from(extremes=[{"objects.duck.young": STIFF.high}])
     frames = np.asarray(film(arrays(DUCK), made))
     for number, frame in enumerate(frames):
-        io.write_image(STUDIES / "duck_video" / f"{number:02d}.png", np.clip(frame, 0, 1))
-    print(f"{len(frames)} frames in examples/studies/duck_video")
+        io.write_image(options.frames / f"{number:02d}.png", np.clip(frame, 0, 1))
+    return f"{len(frames)} frames in {options.frames}"
 
 
 PARTS = {
@@ -233,11 +225,8 @@ PARTS = {
     "field": ("A field: stiffness and density of three parts", field),
     "other": ("A video that the model did not draw", other),
     "cost": ("What a gradient costs", cost),
+    "video": ("Frames of the study", video),
 }
-
-if __name__ == "__main__":
-    use_host_devices()
-    if sys.argv[1:] == ["video"]:
-        video()
-    else:
-        run_parts("bench_identification.py", "System identification from video", PARTS, __doc__)
+OPTIONS = {"frames": {"type": Path, "default": ROOT / "out" / "duck_video",
+                      "help": "folder of part video; the study reads examples/studies/duck_video"}}  # fmt: skip
+DEVICES = None

@@ -1,8 +1,7 @@
-"""The clamp's ablation: `python benchmarks/bench_ablation.py [bent pressed drawn] [--write docs/results/ABLATION.md]`.
+"""The clamp's ablation: its modes and weights against a dense reference.
 
 The modes of `eigen_clamp` on three objects that deform little, much and extremely, beside a truth made of many small
-parts (`ablation.reference`); then sweeps of lambda_R × lambda_S and of tau_max × tau_min for "aligned". `--write`
-replaces the scenes' sections of the page, and their pictures in docs/media.
+parts (`ablation.reference`); then sweeps of lambda_R × lambda_S and of tau_max × tau_min for "aligned".
 """
 
 from functools import partial
@@ -13,17 +12,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _pages import run_parts
-from _timing import measure
-from ablation.pictures import write_heat, write_row
-from ablation.reference import EXACT, render_parts, split
-from ablation.scenes import Subject, subjects
-from ablation.scores import ASPECT, GROWTH, SHARE, image_scores, needles
 
 import pigjax as pj
+from benchmarks.ablation.pictures import write_heat, write_row
+from benchmarks.ablation.reference import EXACT, render_parts, split
+from benchmarks.ablation.scenes import Subject, subjects
+from benchmarks.ablation.scores import ASPECT, GROWTH, SHARE, image_scores, needles
+from benchmarks.common.pages import head, picture, row
+from benchmarks.common.timing import measure
 from pigjax.splatting.types import as_splats
 
-MEDIA = Path(__file__).parents[1] / "docs/media"
 MODES = ("fixed", "covariance", "literal", "aligned")
 LAMBDAS = np.linspace(0, 1.5, 9)
 TAU_MAX, TAU_MIN = np.geomspace(1, 8, 7), np.geomspace(0.125, 1, 7)
@@ -62,8 +60,10 @@ def prepare(subject: Subject, pixels: int) -> Case:
     return Case(moved, rest, jnp.asarray(Fs[0]), camera, truth, coarse, floor, counts)
 
 
-def study(subject: Subject, pixels: int, media: Path | None) -> str:
-    """Tables of one subject as Markdown."""
+def study(name: str, options) -> str:
+    """Tables of one subject as Markdown, and its pictures."""
+    (subject,) = subjects((name,))
+    media, pixels = options.media, options.pixels
     case = prepare(subject, pixels)
     stretch = np.linalg.svd(np.asarray(case.F), compute_uv=False)
     strain = f"{np.percentile(stretch, 1):.2f} to {np.percentile(stretch, 99):.2f}"
@@ -75,19 +75,27 @@ def study(subject: Subject, pixels: int, media: Path | None) -> str:
         f" against {case.counts[0]} parts of twice the size; the two references agree to"
         f" {float(image_scores(case.coarse, case.truth)['psnr']):.1f} dB.",
         "",
-        f"| mode | PSNR | SSIM | PSNR/2 | holes % | spill % | aspect > {ASPECT:g} % | grown > {GROWTH:g}x %"
-        f" | larger than {100 * SHARE:g} % of object % | ms/frame |",
-        "|" + "---|" * 10,
+        head(
+            "mode",
+            "PSNR",
+            "SSIM",
+            "PSNR/2",
+            "holes %",
+            "spill %",
+            f"aspect > {ASPECT:g} %",
+            f"grown > {GROWTH:g}x %",
+            f"larger than {100 * SHARE:g} % of object %",
+            "ms/frame",
+        ),
     ]
     images = {"reference": case.truth}
     for mode in MODES:
-        row, images[mode] = row_of(case, mode)
-        lines.append(row)
+        line, images[mode] = row_of(case, mode)
+        lines.append(line)
     lines += ["", *sweeps(subject, case, media)]
-    if media:
-        write_row(media / f"ablation_{subject.name}.png", images)
-        lines += ["", f"![reference and modes](../media/ablation_{subject.name}.png)"]
-    return "\n".join(lines)
+    drawing = f"ablation_{subject.name}.png"
+    write_row(media / drawing, images)
+    return "\n".join([*lines, "", picture(drawing, "reference and modes")])
 
 
 def row_of(case: Case, mode: str) -> tuple[str, pj.Frame]:
@@ -100,10 +108,10 @@ def row_of(case: Case, mode: str) -> tuple[str, pj.Frame]:
     def draw(gaussians, F):  # as users draw: the default settings
         return pj.render(pj.eigen_clamp(gaussians, F, pj.ClampParams(), mode=mode), case.camera, background=1.0).rgb
 
-    _, seconds, _ = measure(draw, case.gaussians, case.F, repeats=5, seconds=3.0)
-    percents = " | ".join(f"{100 * float(v):.2f}" for v in (ours["holes"], ours["spill"], *(shares[k] for k in shares)))
-    scores = f"{float(ours['psnr']):.2f} | {float(ours['ssim']):.4f} | {float(half['psnr']):.2f}"
-    return f"| {mode} | {scores} | {percents} | {1e3 * seconds:.1f} |", frame
+    seconds = measure(draw, case.gaussians, case.F, windows=5, seconds=3.0).seconds
+    percents = [f"{100 * float(v):.2f}" for v in (ours["holes"], ours["spill"], *shares.values())]
+    scores = f"{float(ours['psnr']):.2f}", f"{float(ours['ssim']):.4f}", f"{float(half['psnr']):.2f}"
+    return row(mode, *scores, *percents, f"{1e3 * seconds:.1f}"), frame
 
 
 @eqx.filter_jit
@@ -117,7 +125,7 @@ def grid_scores(case: Case, params: pj.ClampParams) -> dict[str, jax.Array]:
     return jax.lax.map(one, params)
 
 
-def sweeps(subject: Subject, case: Case, media: Path | None) -> list[str]:
+def sweeps(subject: Subject, case: Case, media: Path) -> list[str]:
     """Best of both sweeps beside the paper's numbers, and their heat maps."""
     r, s = (v.ravel() for v in np.meshgrid(LAMBDAS, LAMBDAS, indexing="ij"))
     high, low = (v.ravel() for v in np.meshgrid(TAU_MAX, TAU_MIN, indexing="ij"))
@@ -134,11 +142,11 @@ def sweeps(subject: Subject, case: Case, media: Path | None) -> list[str]:
         "paper's lambdas": grid_scores(case, params(low, high, 1.2 * ones, 0.8 * ones)),
         "lambdas of 1": grid_scores(case, params(low, high, ones, ones)),
     }
-    lines = ["| sweep of `aligned` | by | where | PSNR | SSIM | holes % | spill % |", "|" + "---|" * 7]
+    lines = [head("sweep of `aligned`", "by", "where", "PSNR", "SSIM", "holes %", "spill %")]
 
     def line(title, by, where, scores, k):
         psnr, ssim, holes, spill = (float(scores[name][k]) for name in ("psnr", "ssim", "holes", "spill"))
-        return f"| {title} | {by} | {where} | {psnr:.2f} | {ssim:.4f} | {100 * holes:.2f} | {100 * spill:.2f} |"
+        return row(title, by, where, f"{psnr:.2f}", f"{ssim:.4f}", f"{100 * holes:.2f}", f"{100 * spill:.2f}")
 
     lines.append(line("paper", "-", "λR 1.2, λS 0.8, τ 0.5 to 2", paper, 0))
     grids = [("λ, τ 0.5 to 2", by_lambda, lambda k: f"λR {r[k]:.2f}, λS {s[k]:.2f}")]
@@ -149,23 +157,13 @@ def sweeps(subject: Subject, case: Case, media: Path | None) -> list[str]:
         for by, values in tops.items():
             k = int(np.argmax(values))
             lines.append(line(title, by, where(k), scores, k))
-    if media:
-        write_heat(
-            media / f"ablation_{subject.name}_sweep.png",
-            (LAMBDAS, np.reshape(by_lambda["psnr"], (9, 9)), (r[best], s[best])),
-            (TAU_MAX, TAU_MIN, np.reshape(by_tau["lambdas of 1"]["psnr"], (7, 7))),
-        )
-        lines += ["", f"![sweeps](../media/ablation_{subject.name}_sweep.png)"]
-    return lines
+    drawing = f"ablation_{subject.name}_sweep.png"
+    write_heat(
+        media / drawing, (LAMBDAS, np.reshape(by_lambda["psnr"], (9, 9)), (r[best], s[best])),
+        (TAU_MAX, TAU_MIN, np.reshape(by_tau["lambdas of 1"]["psnr"], (7, 7))),
+    )  # fmt: skip
+    return [*lines, "", picture(drawing, "sweeps")]
 
 
-def part(name, options):
-    (subject,) = subjects((name,))
-    return study(subject, options.pixels, MEDIA if options.write else None)
-
-
-PARTS = {name: (name, partial(part, name)) for name in ("bent", "pressed", "drawn")}
-
-if __name__ == "__main__":
-    pixels = {"type": int, "default": 192, "help": "width and height of pictures"}
-    run_parts("bench_ablation.py", "The clamp's ablation", PARTS, __doc__, pixels=pixels)
+PARTS = {name: (name, partial(study, name)) for name in ("bent", "pressed", "drawn")}
+OPTIONS = {"pixels": {"type": int, "default": 192, "help": "width and height of pictures"}}

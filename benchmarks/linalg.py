@@ -1,13 +1,11 @@
-"""Nanoseconds per 3x3 matrix and relative error, beside LAPACK: `python benchmarks/bench_linalg.py`."""
-
-import argparse
-import statistics
-import time
+"""Decompositions of 3x3 matrices: nanoseconds and relative error, beside LAPACK."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.common.pages import head, row
+from benchmarks.common.timing import measure
 from pigjax.core import linalg
 
 
@@ -51,41 +49,24 @@ ROUTINES = {
 }
 
 
-def measure(function, matrices, repeats):
-    """Compile seconds, warm median nanoseconds per matrix, and the result in float64."""
-    start = time.perf_counter()
-    compiled = jax.jit(function).lower(matrices).compile()
-    compile_seconds = time.perf_counter() - start
-    result = jax.block_until_ready(compiled(matrices))
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(compiled(matrices))
-        times.append(time.perf_counter() - start)
-    result = jax.tree.map(lambda x: np.asarray(x, np.float64), result)
-    return compile_seconds, statistics.median(times) / len(matrices) * 1e9, result
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=100_000)
-    parser.add_argument("--repeats", type=int, default=9)
-    options = parser.parse_args()
+def decompose(options):
+    """Print a line for each routine and each of both libraries, on random matrices in float32."""
     random = np.random.default_rng(0).normal(size=(options.count, 3, 3)).astype(np.float32)
+    print(head("routine", "by", "ns per matrix", "compile s", "relative error, largest", "median"))
     for name, (ours, lapack, rebuild, prepare) in ROUTINES.items():
         matrices = prepare(random)
-        line = f"{name:12s} {options.count} f32"
         for label, function in (("pigjax", ours), ("LAPACK", lapack)):
             if function is None:
                 continue
-            compile_seconds, nanoseconds, result = measure(function, jnp.asarray(matrices), options.repeats)
-            line += f"  {label} {nanoseconds:7.0f} ns/matrix compile {compile_seconds:.2f} s"
+            found, errors = measure(function, jnp.asarray(matrices)), ("", "")
             if rebuild is not None:
                 exact = matrices.astype(np.float64)
-                error = np.linalg.norm(rebuild(result) - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
-                line += f" rel.err max {error.max():.1e} median {np.median(error):.1e}"
-        print(line, flush=True)
+                again = rebuild(jax.tree.map(lambda x: np.asarray(x, np.float64), found.result))
+                error = np.linalg.norm(again - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
+                errors = f"{error.max():.1e}", f"{np.median(error):.1e}"
+            each = 1e9 * found.seconds / options.count
+            print(row(name, label, f"{each:.0f}", f"{found.compile_seconds:.2f}", *errors))
 
 
-if __name__ == "__main__":
-    main()
+PARTS = {"matrices": ("Decompositions of 3x3 matrices", decompose)}
+OPTIONS = {"count": {"type": int, "default": 100_000, "help": "matrices"}}

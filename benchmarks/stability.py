@@ -1,20 +1,18 @@
-"""MLS-MPM at its extremes: `python benchmarks/bench_stability.py [--laws ...] [--write docs/results/STABILITY.md]`.
+"""MLS-MPM at its extremes: stability of every law.
 
-One program per law (125 particles of two materials, 200 steps) meets every extreme. Tables: what each extreme ends in,
-how far steps may exceed the stable one, error against time over the length of steps, and what is refused.
+One program per law (125 particles of two materials, 200 steps) meets every extreme. Tables: the end of each extreme,
+how far steps may exceed the stable one, error against time over the length of steps, and refused inputs.
 """
 
-import argparse
-import sys
-import time
-from pathlib import Path
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _timing import machine
 
+from benchmarks.common.pages import head, row, table
+from benchmarks.common.timing import clock
 from pigjax.core.errors import InputError, SimulationError
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, fit_grid, make_particles, vast_grid
@@ -196,17 +194,17 @@ def all_nan(law):
 
 
 def alone_and_coincident(law):
-    """27 points 3.5 cells apart with four or five particles each fall freely; error of the way."""
+    """27 points 3.5 cells apart with four or five particles each fall freely; error of the distance."""
     points = np.stack(np.meshgrid(*[np.array([4.0, 7.5, 11.0]) * DX] * 3, indexing="ij"), -1).reshape(-1, 3)
     table = table_of(law)
     start = cube(table, x=points[np.arange(SIDE**3) % 27])
     end, _, health, dt = run(start, table, gravity=(0.0, 0.0, -1.0), dt=1e-3)
-    way = -(dt**2) * 200 * 201 / 2
-    return outcome(health, end, f"{np.abs((end.x - start.x)[:, 2] / way - 1).max():.0e}")
+    distance = -(dt**2) * 200 * 201 / 2
+    return outcome(health, end, f"{np.abs((end.x - start.x)[:, 2] / distance - 1).max():.0e}")
 
 
 def fast(law):
-    """1e5 m/s through a domain of 1 km; error of the way."""
+    """1e5 m/s through a domain of 1 km; error of the distance."""
     table = table_of(law, size=1e3)
     start = cube(table, size=1e3, centre=(0.3, 0.5, 0.5), velocity=(1e5, 0.0, 0.0))
     end, _, health, dt = run(start, table, grid=grid_of(1e3), share=0.05)
@@ -249,7 +247,7 @@ def far(offset):
 
 
 def slow_drift(young):
-    """1 mm/s in matter of that stiffness; error of the way in 200 steps."""
+    """1 mm/s in matter of that stiffness; error of the distance in 200 steps."""
 
     def case(law):
         table = table_of(law, young=young)
@@ -278,12 +276,12 @@ EXTREMES = {
     "F is NaN: others": bad_number("F", jnp.nan),
     "volume is NaN: others": bad_number("volume0", jnp.nan),
     "all x are NaN": all_nan,
-    "alone, coincident: way": alone_and_coincident,
-    "1e5 m/s: way": fast,
+    "alone, coincident: distance": alone_and_coincident,
+    "1e5 m/s: distance": fast,
     "1e5 m/s into the floor": fast_impact,
     **{f"scene × {size:g}: cells": scaled(size) for size in (1e-6, 1e-3, 1e3, 1e4)},
     **{f"{offset:g} m from the origin: spacings": far(offset) for offset in (1e3, 1e4)},
-    **{f"1 mm/s at E = {e:g}: way": slow_drift(e) for e in (1e5, 1e7, 1e9)},
+    **{f"1 mm/s at E = {e:g}: distance": slow_drift(e) for e in (1e5, 1e7, 1e9)},
 }
 
 
@@ -360,89 +358,54 @@ def refusals():
     }
 
 
+def extremes(options):
+    """The table of all laws at all extremes."""
+    jax.config.update("jax_enable_x64", options.x64)
+    print(paragraph(PREFACE) + "\n")
+    cells: dict[str, list[str]] = {name: [] for name in EXTREMES}
+    took = []
+    for law in options.laws:
+        compiling, _ = clock(lambda law=law: run(cube(table_of(law)), table_of(law))[:3])
+        running, _ = clock(lambda law=law: [cells[name].append(case(law)) for name, case in EXTREMES.items()])
+        took.append(f"{law} {compiling:.0f} + {running:.0f}")
+    print(table(["", *options.laws], [[name, *of_laws] for name, of_laws in cells.items()]))
+    return f"\nSeconds to compile + to run all rows: {', '.join(took)}."
+
+
+def by_law(options, text, columns, study):
+    """A table with a line for each law."""
+    jax.config.update("jax_enable_x64", options.x64)
+    print(f"{paragraph(text)}\n\n{head('law', *columns)}")
+    for law in options.laws:
+        print(row(law, *study(law)))
+
+
+def refused(options):
+    """The table of inputs that are refused, and the errors."""
+    jax.config.update("jax_enable_x64", options.x64)
+    print(head("input", "error"))
+    for name, act in refusals().items():
+        try:
+            act()
+            said = "not refused"
+        except (InputError, SimulationError) as error:
+            said = str(error).replace("|", "\\|").replace("\n", " ")
+        except Exception as error:
+            said = f"**unclear:** {type(error).__name__}: {error}"
+        print(row(name, said))
+
+
 def paragraph(text):
     return " ".join(text.split())
 
 
-def table_lines(head, rows):
-    yield "| " + " | ".join(head) + " |"
-    yield "|" + "---|" * len(head)
-    yield from ("| " + " | ".join(row) + " |" for row in rows)
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--laws", nargs="+", default=MOVING, choices=MOVING)
-    parser.add_argument("--write", type=Path, help="file for the same lines")
-    parser.add_argument("--x64", action="store_true", help="float64")
-    arguments = parser.parse_args()
-    jax.config.update("jax_enable_x64", arguments.x64)
-    begun = time.perf_counter()
-    lines = []
-
-    def say(*new):
-        lines.extend(new)
-        print(*new, sep="\n", flush=True)
-
-    cells = {name: [] for name in EXTREMES}
-    seconds, breaks, trades = [], [], []
-    for law in arguments.laws:
-        at = time.perf_counter()
-        run(cube(table_of(law)), table_of(law))
-        compiled = time.perf_counter()
-        for name, case in EXTREMES.items():
-            cells[name].append(case(law))
-        done = time.perf_counter()
-        seconds.append(f"{compiled - at:.0f} + {done - compiled:.0f}")
-        breaks.append([law, *margins(law)])
-        trades.append([law, *trade(law)])
-        print(
-            f"{law}: compiled in {compiled - at:.0f} s, {len(EXTREMES)} extremes in {done - compiled:.1f} s",
-            file=sys.stderr,
-        )
-
-    say(
-        "# Stability at the extremes",
-        "",
-        __doc__.splitlines()[0],
-        "",
-        f"{machine()}; {'float64' if arguments.x64 else 'float32'}.",
-        "",
-    )
-    say(paragraph(PREFACE), "")
-    say(*table_lines(["", *arguments.laws], [[name, *row] for name, row in cells.items()]))
-    say(
-        "",
-        "Seconds to compile + to run all rows: "
-        + ", ".join(f"{law} {s}" for law, s in zip(arguments.laws, seconds))
-        + ".",
-    )
-    say("", "## How far `stable_dt` is from the edge", "", paragraph(MARGINS), "")
-    say(*table_lines(["law", "squeezed by 3 %, free", "thrown at the floor at c/10", "at c/2"], breaks))
-    say("", "## Length of steps against error", "", paragraph(TRADE), "")
-    say(*table_lines(["law", *(f"{share} of the step" for share in (0.1, 0.2, 0.5, 1, 2))], trades))
-    say("", "## Refused", "")
-    rows = []
-    for name, act in refusals().items():
-        try:
-            act()
-            rows.append([name, "not refused"])
-        except (InputError, SimulationError) as error:
-            rows.append([name, str(error).replace("|", "\\|").replace("\n", " ")])
-        except Exception as error:
-            rows.append([name, f"**unclear:** {type(error).__name__}: {error}"])
-    say(*table_lines(["input", "what is said"], rows))
-    say("", f"All of it: {time.perf_counter() - begun:.0f} s.")
-    if arguments.write:
-        arguments.write.write_text("\n".join(lines) + "\n")
-
-
 PREFACE = """
 Every law that moves meets every extreme: 125 particles of two materials in 16³ nodes, E = 2e4 Pa, ν = 0.3, 1,000
-kg/m³, 200 steps of the stable length unless stated, longer ones forced. A cell is what `Health` counts (`esc` left
+kg/m³, 200 steps of the stable length unless stated, longer ones forced. A cell tells the counts of `Health` (`esc` left
 the grid, `inv` turned inside out, `nan` became NaN or infinite, `cfl` cells in a step; `ok` nothing), then a number:
-*energy*, the most kinetic energy of any frame in parts of what was given; *momentum*, lost share; *others*, how far
-[cells] the other particles are from where they go without that one; *way*, relative error of free flight; *cells*,
+*energy*, the most kinetic energy of any frame in parts of that given; *momentum*, lost share; *others*, how far
+[cells] the other particles are from where they go without that one; *distance*, relative error of the distance in
+free flight; *cells*,
 difference from the scene of ordinary size, scaled back; *spacings*, difference from the origin in spacings of
 floating point there. Plastic laws and fluids put an F that is flat or inside out in order before the first step.
 Particles that no field counts are finite: the benchmark stops otherwise. Snow makes energy (1.30) where ν nears 0.5:
@@ -459,5 +422,15 @@ its steps. Shorter steps are not nearer to the truth: each transfer to the grid 
 should keep its energy loses more of it in more steps.
 """
 
-if __name__ == "__main__":
-    main()
+EDGES = ("squeezed by 3 %, free", "thrown at the floor at c/10", "at c/2")
+LENGTHS = [f"{share} of the step" for share in (0.1, 0.2, 0.5, 1, 2)]
+PARTS = {
+    "extremes": ("Extremes", extremes),
+    "margins": ("How far `stable_dt` is from the edge", partial(by_law, text=MARGINS, columns=EDGES, study=margins)),
+    "trade": ("Length of steps against error", partial(by_law, text=TRADE, columns=LENGTHS, study=trade)),
+    "refused": ("Refused", refused),
+}
+OPTIONS = {
+    "laws": {"nargs": "+", "default": MOVING, "choices": MOVING, "help": "that move"},
+    "x64": {"action": "store_true", "help": "float64"},
+}
