@@ -64,7 +64,7 @@ def write_animation(clips: dict[str, np.ndarray], path: Path) -> None:
     shown = [tiles(clips[name], PLAYED, TILE, name, named=PLAYED) for name in sorted(clips)]
     columns = int(np.ceil(np.sqrt(len(shown))))
     pictures = [Image.fromarray(contact_sheet(frames, columns, gap=0)) for frames in zip(*shown)]
-    # one palette without dithering: what rests stays the same pixels and costs nothing
+    # one palette without dithering: matter at rest stays the same pixels and costs nothing
     palette = few_colours(pictures[len(pictures) // 2], 128)
     pictures = [page.quantize(palette=palette, dither=Image.Dither.NONE) for page in pictures]
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=90, loop=0, optimize=True)

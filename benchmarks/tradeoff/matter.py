@@ -53,9 +53,9 @@ def _study(name):
     timed = in_turn(runs, windows=3 if name != "tabletop" else 1)
     count = len(of.inputs.gaussians)
     ends = {key: _of_gaussians(plans.get(key, plans["standard"]), timed[key].result[-1], count) for key in settings}
-    finest, way = plans["reference"], np.asarray(timed["reference"].result)
+    finest, path = plans["reference"], np.asarray(timed["reference"].result)
     rows, _ = tracers(finest, count)
-    travelled = distance_travelled(np.concatenate([np.asarray(finest.particles.x)[None, rows], way[:, rows]]))
+    travelled = distance_travelled(np.concatenate([np.asarray(finest.particles.x)[None, rows], path[:, rows]]))
     body = np.asarray(of.labels.object_id)
 
     def error(x, reference):

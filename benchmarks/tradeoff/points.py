@@ -11,7 +11,7 @@ from benchmarks.common.pages import head, picture, row
 
 
 class Point(NamedTuple):
-    """One setting: what it takes and how wrong it is."""
+    """One setting: its time and its error."""
 
     name: str
     knob: str  # that differs from the standard
