@@ -71,8 +71,8 @@ def two_discs():
     In the single field bodies meet on the grid, so they feel each other about a cell before they touch, and pull on
     each other as they part: `pull` is the share of the speed of separation that this takes. With `BodyContact` they
     meet within a cell of where they touch (the row counts from a loss of 1 % of the speed), part earlier, and nothing
-    pulls. The energy that the centres of mass lose is physical in part: it stays in the discs as vibration, of which APIC then
-    damps what the grid cannot resolve. `energy kept` is kinetic and strain energy together at 3.6 s.
+    pulls. The energy that the centres of mass lose is physical in part: it stays in the discs as vibration, of which
+    APIC then damps the part that the grid cannot resolve. `energy kept` is kinetic and strain energy together at 3.6 s.
     """
     rows, series = [], {}
     apart = BodyContact(bodies=2)
