@@ -23,7 +23,7 @@ STUDIES = EXAMPLES / "studies"
 THROW = "objects.soccerball.velocity"
 EDGE = -0.39  # of the table [m]
 OFF = EDGE - 0.02  # a middle of the cube that is off [m]
-WANTED = -0.5  # what the objective asks of it [m]
+WANTED = -0.5  # that the objective asks for [m]
 WEAK = [0.1, -1.2, 0.3]  # reaches the cube and leaves it on the table
 WIDE = [-0.8, -0.8, 0.2]  # passes it
 HARD = [0.2, -2.5, 0.5]  # knocks it far off
@@ -127,6 +127,6 @@ def cost(_) -> None:
 PARTS = {
     "throw": ("A throw that knocks the cube off", throw),
     "miss": ("From a throw that misses", miss),
-    "cost": ("What it costs, beside a search without gradients", cost),
+    "cost": ("Cost beside a search without gradients", cost),
 }
 DEVICES = None

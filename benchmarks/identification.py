@@ -224,7 +224,7 @@ PARTS = {
     "two": ("Two objects of different stiffness", two),
     "field": ("A field: stiffness and density of three parts", field),
     "other": ("A video that the model did not draw", other),
-    "cost": ("What a gradient costs", cost),
+    "cost": ("Cost of a gradient", cost),
     "video": ("Frames of the study", video),
 }
 OPTIONS = {"frames": {"type": Path, "default": ROOT / "out" / "duck_video",

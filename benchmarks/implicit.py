@@ -1,8 +1,8 @@
 """Explicit against implicit steps over Young's modulus: time and error.
 
 A block of 5 cells a side is thrown at 1 m/s along a frictional floor and settles on it, for 0.1 s in frames of 1/40 s.
-Errors are the farthest particle's, relative to the longest way, against explicit float64 steps of half the stable
-length. Seconds are per simulated second, warm, on one device.
+Errors are the farthest particle's, relative to the longest displacement, against explicit float64 steps of half the
+stable length. Seconds are per simulated second, warm, on one device.
 """
 
 import math
@@ -54,10 +54,10 @@ def compare(options):
             stable = choose_substeps(particles, grid, table, SimConfig(), **steps)
             auto = choose_integrator(particles, grid, table, SimConfig(integrator="auto"), **steps).integrator
             exact, start, *_ = run(young, np.float64, windows=1, substeps=2 * stable)
-            exact, way = np.asarray(exact), np.abs(exact - start).max()
+            exact, farthest = np.asarray(exact), np.abs(exact - start).max()
         for integrator, substeps in (("explicit", stable), *(("implicit", n) for n in options.substeps)):
             end, _, seconds, taken, health = run(young, np.float32, integrator=integrator, substeps=substeps)
-            error = np.abs(np.asarray(end, np.float64) - exact).max() / way
+            error = np.abs(np.asarray(end, np.float64) - exact).max() / farthest
             rate = seconds / (FRAMES * FRAME_DT)
             unconverged = int(health.unconverged) if math.isfinite(error) else "broke down"
             print(row(f"{young:.0e}", integrator, taken, f"{rate:.2f}", f"{error:.1e}", unconverged, auto))

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 
 from benchmarks.common.pages import EXAMPLES, ROOT, TABLETOP, head, row
 from benchmarks.common.timing import clock
-from pigjax import write_video
+from pigjax.io import contact_sheet, write_video
 from pigjax.scene import load_scene, run_scene
 
 SCENES = {path.stem: path for path in sorted((EXAMPLES / "materials").glob("*.toml"))}
@@ -53,51 +53,36 @@ def run(scene: Path, folder: Path) -> str:
 
 def write_sheet(clips: dict[str, np.ndarray], path: Path) -> None:
     """Two columns of clips, each a row of pictures from its first to its last."""
-    count, (width, height) = SHEET
-    names = sorted(clips)
-    rows = -(-len(names) // 2)
-    sheet = Image.new("RGB", (2 * count * width + 8, rows * height), "white")
-    for place, name in enumerate(names):
-        left, top = (place // rows) * (count * width + 8), place % rows * height
-        for i, frame in enumerate(evenly(clips[name], count)):
-            sheet.paste(
-                Image.fromarray(frame).resize((width, height), Image.Resampling.LANCZOS), (left + i * width, top)
-            )
-        label(sheet, name, (left + 4, top + 2))
-    few_colours(sheet, 256).save(path, optimize=True)
+    names, rows = sorted(clips), -(-len(clips) // 2)
+    ordered = [name for row in range(rows) for name in names[row::rows]]
+    frames = [tile for name in ordered for tile in tiles(clips[name], *SHEET, name, named=1)]
+    few_colours(Image.fromarray(contact_sheet(frames, 2 * SHEET[0], gap=2)), 256).save(path, optimize=True)
 
 
 def write_animation(clips: dict[str, np.ndarray], path: Path) -> None:
     """All clips side by side, each played once from its first picture to its last."""
-    names = sorted(clips)
-    columns = int(np.ceil(np.sqrt(len(names))))
-    rows = -(-len(names) // columns)
-    shown = {name: evenly(clip, PLAYED) for name, clip in clips.items()}
-    pictures = []
-    for i in range(PLAYED):
-        page = Image.new("RGB", (columns * TILE[0], rows * TILE[1]), "white")
-        for place, name in enumerate(names):
-            at = (place % columns * TILE[0], place // columns * TILE[1])
-            page.paste(Image.fromarray(shown[name][i]).resize(TILE, Image.Resampling.LANCZOS), at)
-            label(page, name, (at[0] + 3, at[1] + 1))
-        pictures.append(page)
-    # one palette without dithering: what rests stays the same pixels and costs nothing
+    shown = [tiles(clips[name], PLAYED, TILE, name, named=PLAYED) for name in sorted(clips)]
+    columns = int(np.ceil(np.sqrt(len(shown))))
+    pictures = [Image.fromarray(contact_sheet(frames, columns, gap=0)) for frames in zip(*shown)]
+    # one palette without dithering: matter at rest stays the same pixels and costs nothing
     palette = few_colours(pictures[len(pictures) // 2], 128)
     pictures = [page.quantize(palette=palette, dither=Image.Dither.NONE) for page in pictures]
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=90, loop=0, optimize=True)
 
 
+def tiles(clip: np.ndarray, count: int, size: tuple[int, int], name: str, named: int) -> list[np.ndarray]:
+    """So many pictures of a clip from its first to its last, the first `named` of them with its name."""
+    chosen = clip[np.linspace(0, len(clip) - 1, count).round().astype(int)]
+    pictures = [Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS) for frame in chosen]
+    for picture in pictures[:named]:
+        text = name.replace("_", " ")
+        ImageDraw.Draw(picture).text((3, 1), text, fill="black", stroke_width=2, stroke_fill="white")
+    return [np.asarray(picture) for picture in pictures]
+
+
 def few_colours(picture: Image.Image, count: int) -> Image.Image:
     """An octree keeps the few bright colours that a median cut spends on shades of the table."""
     return picture.quantize(count, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-
-
-def evenly(clip: np.ndarray, count: int) -> np.ndarray:
-    return clip[np.linspace(0, len(clip) - 1, count).round().astype(int)]
-
-
-def label(page: Image.Image, name: str, at: tuple[int, int]) -> None:
-    ImageDraw.Draw(page).text(at, name.replace("_", " "), fill="black", stroke_width=2, stroke_fill="white")
 
 
 PARTS = {"materials": ("Materials", materials), "tabletop": ("Tabletop", tabletop)}

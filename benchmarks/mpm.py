@@ -134,7 +134,7 @@ STAGES = {
     "take_windows": "to the particles: windows are read",
     "from_grid": "to the particles: sums over windows",
     "law": "the law, and particles move",
-    "health": "health, and what is not finite",
+    "health": "health, and states that are not finite",
 }
 
 

@@ -106,7 +106,7 @@ def outcome(health, end=None, number=None):
 
 
 def stiffness(young, poisson):
-    """Thrown at the floor at 1 m/s under gravity; most kinetic energy of any frame, in parts of what there was."""
+    """Thrown at the floor at 1 m/s under gravity; most kinetic energy of any frame, in parts of the energy given."""
 
     def case(law):
         table = table_of(law, young=young, poisson=poisson)
@@ -413,7 +413,7 @@ its flow bounds each stretch by itself, which turns shear into pressure.
 """
 MARGINS = """
 Stable steps (`cfl` = 0.4) at which a cube breaks down: `Health` counts something, or kinetic energy is more than
-twice what a quarter step gives. In quarters.
+twice that of a quarter step. In quarters.
 """
 TRADE = """
 A cube thrown at the floor, after the time of 80 stable steps: how far its particles are from where steps a tenth as

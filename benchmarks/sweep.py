@@ -132,7 +132,7 @@ def clamp(_):
 
 
 def worker(port, process, of):
-    """The sweep in one of some processes with two devices in all; the first prints what it took."""
+    """The sweep in one of some processes with two devices in all; the first prints its time."""
     use_host_devices(2 // int(of))
     if int(of) > 1:
         jax.distributed.initialize(f"127.0.0.1:{port}", num_processes=int(of), process_id=int(process))

@@ -22,7 +22,7 @@ Field = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 class Subject(NamedTuple):
     name: str
-    told: str  # what happens to it
+    told: str  # its deformation, for the page
     gaussians: pj.Gaussians  # the object alone, without view-dependent colour
     field: Field  # positions [m 3] at rest to positions [m 3] and F [m 3 3]
     size: float  # largest standard deviation of the reference's parts [m]
@@ -136,7 +136,7 @@ def _middle(gaussians):
 
 
 def _objects(names: list[str]) -> dict[str, pj.Gaussians]:
-    """Objects of the bundled tabletop, as their masks cut them out; without what floats apart or is hardly there."""
+    """Objects of the bundled tabletop, cut out by their masks, without floaters and nearly transparent Gaussians."""
     if not names:
         return {}
     scene = load_scene(TABLETOP / "scene.toml")

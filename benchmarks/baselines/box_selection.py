@@ -1,4 +1,4 @@
-"""An object is what lies in its box: the way of PhysGaussian (Xie et al., CVPR 2024).
+"""Objects are the Gaussians in boxes: the method of PhysGaussian (Xie et al., CVPR 2024).
 
 There a user sets an axis-aligned box by hand. Here known labels set it, and the training views choose how many
 outliers it may leave out: a better box than eyes would find.

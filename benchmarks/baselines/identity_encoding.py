@@ -26,7 +26,7 @@ NEIGHBOURS, SAMPLED, INTERVAL, WEIGHT = 5, 1000, 5, 2.0  # of the term in space:
 
 
 class Encoding(NamedTuple):
-    """What is trained."""
+    """Parameters that are trained."""
 
     features: jax.Array  # [n 16] of the Gaussians
     kernel: jax.Array  # [16 m] of the classifier

@@ -5,7 +5,7 @@ A benchmark is a module of this package, or `parts` of a folder. It defines
 - `PARTS`: title and function by name. A function takes the options, prints its tables as they come or gives their text.
 - `OPTIONS`: more options of its command line, settings of `add_argument` by name; may be left out.
 - `DEVICES`: host devices on a CPU, None for one a core; the default is 1.
-- `worker(*arguments)`: what a process started by `start_worker` does; only where there is such a process.
+- `worker(*arguments)`: the task of a process started by `start_worker`; only where there is such a process.
 
 The first line of its docstring describes it in the list.
 """
@@ -26,7 +26,7 @@ HERE = Path(__file__).parents[1]
 
 
 def names() -> dict[str, str]:
-    """What each benchmark measures, by its name; nothing is imported."""
+    """Description of each benchmark by its name; nothing is imported."""
     files = {path.stem: path for path in HERE.glob("[a-z]*.py")}
     files |= {path.parent.name: path for path in HERE.glob("*/parts.py")}
     said = {name: ast.get_docstring(ast.parse(files[name].read_text())) or "" for name in sorted(files)}
@@ -85,7 +85,7 @@ def parser_of(name: str, module: ModuleType) -> argparse.ArgumentParser:
 
 
 def run(module: ModuleType, options: argparse.Namespace, command: str, changed: str, heading: str) -> None:
-    """Print the chosen parts, each with its command, the machine and what it took, and write those asked for."""
+    """Print the chosen parts, each with its command, the machine and its cost, and write those asked for."""
     from benchmarks.common.timing import machine, peak_memory, use_host_devices
 
     use_host_devices(options.devices)

@@ -67,6 +67,6 @@ class _Tee(io.StringIO):
 
 @contextlib.contextmanager
 def kept() -> Iterator[io.StringIO]:
-    """Inside, what is printed is shown and kept."""
+    """Inside, printed text is shown and kept."""
     with contextlib.redirect_stdout(_Tee()) as text:
         yield text

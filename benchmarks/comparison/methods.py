@@ -36,13 +36,13 @@ ANCHORS = 2048  # as in Spring-Gaus
 
 
 class Motion(NamedTuple):
-    """What a method made of the scene."""
+    """Motion of the scene by one method."""
 
     frames: list[Splats]  # rest first
     particles: int
     substeps: int  # per frame
     seconds: float  # of all frames, from the median frame: without compilation
-    compile_seconds: float  # what the frames took beyond that
+    compile_seconds: float  # of the frames, beyond that
 
 
 def ours(setting: Setting, ids: np.ndarray) -> Motion:
@@ -133,7 +133,7 @@ def feature_ids(setting: Setting, steps: int = TRAINING_STEPS) -> np.ndarray:
 
 
 def all_methods(setting: Setting, kept: Callable[..., np.ndarray]) -> dict[str, Callable[[], Motion]]:
-    """By name, each to be called when its turn comes; `kept(name, make)` holds what several of them use."""
+    """By name, each to be called when its turn comes; `kept(name, make)` holds ids that several of them use."""
 
     def by_masks() -> np.ndarray:
         return kept("ids of masks", lambda: lifted_ids(setting))

@@ -1,4 +1,4 @@
-"""The paper's comparison on the bundled tabletop: what every method is given."""
+"""The paper's comparison on the bundled tabletop: inputs of every method."""
 
 from typing import NamedTuple
 

@@ -18,7 +18,7 @@ HEADER = head(
 
 
 class Truth:
-    """What scores compare with, made once."""
+    """The truth that scores compare with, made once."""
 
     def __init__(self, setting: Setting):
         self.setting, self.solids = setting, setting.solids()
@@ -44,7 +44,7 @@ class Truth:
 
 
 def score_row(name: str, motion: Motion, truth: Truth) -> str:
-    """Worst frame of penetration and needles, less what is there at rest; the end for all else."""
+    """Worst frame of penetration and needles, less that at rest; the end for all else."""
     means = [np.asarray(frame.means, float) for frame in motion.frames]
     each = np.array([truth.penetration(at) for at in means])
     overlap, sunk = 1e6 * (each.max(0) - each[0])

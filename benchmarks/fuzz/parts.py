@@ -30,11 +30,11 @@ from pigjax.core.errors import InputError
 
 SECONDS = 10.0  # for one input
 START_SECONDS = 300.0  # to import, to write the valid files and to read them once
-MEMORY = 1 << 30  # beyond what the process holds when all valid files were read [bytes]
+MEMORY = 1 << 30  # beyond that of the process when all valid files were read [bytes]
 
 
 def fuzz(count, seed=0, readers=None, tell=print):
-    """Read `count` damaged inputs; counts of each reader, and what failed as {"reader:number": what came}.
+    """Read `count` damaged inputs; counts of each reader, and failures as {"reader:number": reason}.
 
     Args:
         count: number of inputs, shared among the readers.
@@ -113,8 +113,8 @@ def worker(listing, seed):
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
 
-    def tell(**what):
-        print(json.dumps(what), file=out, flush=True)
+    def tell(**outcome):
+        print(json.dumps(outcome), file=out, flush=True)
 
     warnings.simplefilter("ignore")
     jobs = json.loads(listing.read_text())

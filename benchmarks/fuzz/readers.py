@@ -24,7 +24,7 @@ VIEWS = ("000", "001", "002")
 
 
 class Reader(NamedTuple):
-    """What is read, and what of it is damaged."""
+    """A reader, its valid files, and those of them that are damaged."""
 
     write: Callable[[Path], None]
     read: Callable[[Path], Any]

@@ -44,7 +44,7 @@ def study(scene: Tabletop, _) -> None:
 
 
 def spoil(masks, *, missing=0.0, split=0.0, fused=0.0, seed=0) -> tuple[np.ndarray, np.ndarray]:
-    """Masks with consistent ids but for what is missing or fused, and with ids of 16 bits that differ in every view."""
+    """Masks with consistent ids except missing and fused ones, and masks with other ids of 16 bits in every view."""
     rng = np.random.default_rng(seed)
     consistent, scrambled = np.array(masks, np.int32), np.zeros(masks.shape, np.int32)
     for mask, out in zip(consistent, scrambled):

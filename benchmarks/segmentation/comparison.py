@@ -31,7 +31,7 @@ RIGHT, TOO_MUCH, MISSED = (0.35, 0.70, 0.40), (0.85, 0.20, 0.15), (0.20, 0.40, 0
 
 
 class Answer(NamedTuple):
-    """One answer: which Gaussians are which object, and what it took."""
+    """One answer: Gaussians of each object, and its cost."""
 
     name: str
     members: np.ndarray  # [n m] bool; a Gaussian may be in several objects, or in none
@@ -47,7 +47,7 @@ class Learnt(NamedTuple):
     name: str
     fitted: Fitted
     members: Callable[..., np.ndarray]  # of parameters
-    masks: Callable[..., np.ndarray]  # of camera: what the images themselves say of each id, [h w m] bool
+    masks: Callable[..., np.ndarray]  # of camera: pixels of each id by the images themselves, [h w m] bool
 
 
 def compare(scene: Tabletop, options) -> str:
@@ -128,7 +128,7 @@ def study(
 
 
 def _vote(name, gaussians, train, num_ids, one_hot, **settings) -> Answer:
-    """Ours, warm. What `min_seen` leaves out stays out."""
+    """Ours, warm. Gaussians that `min_seen` leaves out stay out."""
 
     def answer():
         labels = lift_masks(gaussians, train.cameras, train.masks, num_ids=num_ids, **settings)

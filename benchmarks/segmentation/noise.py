@@ -41,7 +41,7 @@ def dropped(masks, percent: float, rng) -> np.ndarray:
     """This share of the views without masks.
 
     With background = "ignore" the background has a say only where no object has a vote, so a view of background is no
-    view: all shapes stay the same, and nothing compiles anew.
+    view: all shapes stay the same, and nothing is recompiled.
     """
     result = masks.copy()
     result[rng.permutation(len(masks))[: round(len(masks) * percent / 100)]] = 0
@@ -95,7 +95,7 @@ def _score(scene: Tabletop, masks, weighting: str) -> tuple[float, float]:
     """Share of Gaussians right, and mIoU [%] on the test views."""
     labels = lift_masks(scene.gaussians, scene.train.cameras, masks, num_ids=scene.num_ids, weighting=weighting)
     found = np.asarray(labels.object_id)
-    # everything in this scene is an object: background is what no mask spoke of
+    # everything in this scene is an object: background are the Gaussians without a mask
     unlabelled = Labels(jnp.asarray(np.where(found > 0, found, -1)), labels.votes, labels.confidence)
     filled = fill_unseen(scene.gaussians, unlabelled)
     objects = [number for number in scene.names if number not in (0, TABLE)]

@@ -14,7 +14,7 @@ from pigjax.io import Views, load_ply, load_views, read_json
 from pigjax.segmentation import Labels, enough_capacity, object_mask
 from pigjax.splat import Gaussians, RenderConfig
 
-TABLE = 1  # its own mask is what the other objects leave of it
+TABLE = 1  # its mask excludes the other objects
 
 
 class Tabletop(NamedTuple):

@@ -30,7 +30,7 @@ def _table(scene: Tabletop, ply: Path) -> str:
     columns, rows = ["labels", "drawn", *(scene.names[number] for number in objects), "mean", "table"], []
     for kind, settings in KINDS.items():
         labels = lift_masks(gaussians, scene.train.cameras, scene.train.masks, num_ids=scene.num_ids, **settings)
-        # what is hidden or contested on purpose must not come back from its neighbours
+        # labels that were left out on purpose must not come back from neighbours
         labels = labels if {"min_seen", "purity"} & set(settings) else fill_unseen(gaussians, labels)
         for mode in ("isolated", "visible"):
             scores = scores_by_object(gaussians, labels.object_id, scene.test, [*objects, TABLE], mode=mode)

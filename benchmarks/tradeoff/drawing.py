@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.common import pages
 from benchmarks.common.timing import in_turn
 from benchmarks.tradeoff.errors import enlarged, root_mean_square, video_psnr
-from benchmarks.tradeoff.points import Point, plot, table
+from benchmarks.tradeoff.points import Point, by_scene
 from benchmarks.tradeoff.scenes import as_float64, picture, pose, simulate, source
 from pigjax import prune
 from pigjax.scene.plan import make_cameras
@@ -32,17 +31,12 @@ SCALES, KEPT, ROOM = (0.75, 0.5), (0.75, 0.5), 0.8
 
 
 def study(options) -> str:
-    """Tables of all scenes, and one plot."""
-    panels = {name: _study(name) for name in options.scenes}
-    text = []
-    for name, points in panels.items():
-        text += [f"**{name}**", table(points, error="RMS error of colour")]
-    plot(panels, options.media / PLOT, error="RMS error of colour")
-    head = (
+    """Tables of all scenes and one plot."""
+    print(
         "One picture of the deformed scene. Reference: the exact setting (alpha ≥ 1e-6, no early stop) in float64. Of a"
-        " smaller picture the error is that of the picture enlarged."
+        " smaller picture the error is that of the picture enlarged.\n"
     )
-    return "\n\n".join([head, *text, pages.picture(PLOT, "error against time of drawing")])
+    return by_scene(options, lambda name: (_study(name), None, ""), PLOT, error="RMS error of colour")
 
 
 def _study(name):

@@ -11,13 +11,13 @@ class Displacement(NamedTuple):
 
     total: float
     centre: float  # of the centre of mass of each body
-    shape: float  # what is left without the centres
+    shape: float  # the rest, without the centres
 
 
 def distance_travelled(path) -> float:
     """Root mean square over points of the length of their path [t p 3], the start included.
 
-    What bounces ends near its start, so the distance between the two would measure nothing.
+    Matter that bounces ends near its start, so the distance between the two would measure nothing.
     """
     steps = np.linalg.norm(np.diff(np.asarray(path, np.float64), axis=0), axis=2)
     return float(np.sqrt(np.mean(steps.sum(0) ** 2)))

@@ -4,13 +4,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 from matplotlib.figure import Figure
 
-from benchmarks.common.pages import head, row
+from benchmarks.common.pages import head, picture, row
 
 
 class Point(NamedTuple):
-    """One setting: what it takes and how wrong it is."""
+    """One setting: its time and its error."""
 
     name: str
     knob: str  # that differs from the standard
@@ -29,6 +30,17 @@ def pareto(points: Sequence[Point]) -> set[str]:
             best |= {p.name for p in ties}
             least = point.error
     return best
+
+
+def by_scene(options, study: Callable, file: str, *, error: str) -> str:
+    """Tables of all scenes, printed as they come, and one plot; `study(name)` gives points, floor or None, and text."""
+    panels, floors = {}, {}
+    for name in options.scenes:
+        jax.clear_caches()  # compiled programs are mapped into memory piece by piece, and the pieces have a limit
+        panels[name], floors[name], said = study(name)
+        print("\n\n".join(text for text in (f"**{name}**", said, table(panels[name], error=error)) if text) + "\n")
+    plot(panels, options.media / file, error=error, floors={name: floor for name, floor in floors.items() if floor})
+    return picture(file, "error against time")
 
 
 def table(points: Sequence[Point], *, error: str, show: Callable[[float], str] = "{:.2e}".format) -> str:

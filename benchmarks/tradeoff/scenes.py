@@ -1,4 +1,4 @@
-"""The bundled tabletop, a jelly cube and a cube of sand made here, and their way to pictures, stage by stage."""
+"""The bundled tabletop, a jelly cube and a cube of sand made here, and their pipeline to pictures, stage by stage."""
 
 import tempfile
 import tomllib
@@ -27,7 +27,7 @@ SIDE, HEIGHT = 0.2, 0.24  # of the cube, and of its middle above the floor [m]
 
 
 class Source(NamedTuple):
-    """A scene file's values, what it reads, and its labels: the same for every setting."""
+    """A scene file's values, its inputs, and its labels: the same for every setting."""
 
     name: str
     values: dict[str, Any]

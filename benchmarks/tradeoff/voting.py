@@ -1,4 +1,4 @@
-"""Voting: share of Gaussians with their true id, over views, resolution of depth and the way of counting."""
+"""Voting: share of Gaussians with their true id, over views, resolution of depth and kind of vote."""
 
 import statistics
 

@@ -1,12 +1,10 @@
 """The whole pipeline: the video's error against the reference's, for the levels of `accuracy` and for single knobs."""
 
-import jax
 import numpy as np
 
-from benchmarks.common.pages import picture
 from benchmarks.common.timing import in_turn
 from benchmarks.tradeoff.errors import root_mean_square, video_psnr
-from benchmarks.tradeoff.points import Point, plot, table
+from benchmarks.tradeoff.points import Point, by_scene
 from benchmarks.tradeoff.scenes import draw, simulate, source
 
 PLOT = "tradeoff_whole.png"
@@ -25,13 +23,7 @@ def study(options) -> str:
         "Seeding, simulating and drawing; reading and voting are the same for all. Error: all frames against those of"
         ' accuracy = "reference", smaller ones enlarged.\n'
     )
-    panels, floors = {}, {}
-    for name in options.scenes:
-        jax.clear_caches()  # compiled programs are mapped into memory piece by piece, and the pieces have a limit
-        panels[name], floors[name], said = _study(name)
-        print(f"**{name}**\n\n{said}\n\n{table(panels[name], error='RMS error of colour')}\n")
-    plot(panels, options.media / PLOT, error="RMS error of colour in the video", floors=floors)
-    return picture(PLOT, "error against time of the whole pipeline")
+    return by_scene(options, _study, PLOT, error="RMS error of colour in the video")
 
 
 def _study(name):

@@ -1,4 +1,4 @@
-"""What the cases share: rows, bodies in one, two and three dimensions, energies, and orders of convergence."""
+"""Shared by the cases: rows, bodies in one, two and three dimensions, energies, and orders of convergence."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Row(NamedTuple):
 
 
 class Case(NamedTuple):
-    """What a case found, and its drawing: `draw(figure)` fills a matplotlib figure."""
+    """Rows of a case, and its drawing: `draw(figure)` fills a matplotlib figure."""
 
     rows: list[Row]
     draw: Callable[[Any], None] | None = None
@@ -93,7 +93,7 @@ def strain_energy(F, volume, table):
 
 
 def spin(p, dx, *, inverse_inertia=4.0):
-    """Angular momentum Σ m x × v and what APIC keeps in C (Jiang et al. 2015, eq. 11) [kg m²/s]."""
+    """Angular momentum Σ m x × v and the part that APIC keeps in C (Jiang et al. 2015, eq. 11) [kg m²/s]."""
     axial = jnp.stack([p.C[:, 2, 1] - p.C[:, 1, 2], p.C[:, 0, 2] - p.C[:, 2, 0], p.C[:, 1, 0] - p.C[:, 0, 1]], -1)
     return (p.mass[:, None] * (jnp.cross(p.x, p.v) + dx**2 / inverse_inertia * axial)).sum(0)
 
