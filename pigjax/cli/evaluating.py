@@ -1,4 +1,4 @@
-"""What `pigjax evaluate` does and leaves: a data set and a scene in, scores and a sheet of masks out."""
+"""`pigjax evaluate`: a data set and a scene in, scores and a sheet of masks out."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MOST_ROWS = 24
 
 
 class Report(NamedTuple):
-    """What was scored, and how prompts found their objects."""
+    """Scores, and how prompts found their objects."""
 
     evaluation: Evaluation
     grounding: str
@@ -60,7 +60,7 @@ def evaluate_files(
         settings: of `lift_masks`.
 
     Raises:
-        StaleError: `out` holds scores of other Gaussians, another data set or other settings; it names what changed.
+        StaleError: `out` holds scores of other Gaussians, another data set or other settings; it names the changes.
         InputError: files that do not fit each other, or cannot be written.
     """
     out = io.output_folder(out, files=("scores.json", "sheet.png"))
@@ -163,7 +163,7 @@ def _as_json(report: Report) -> dict[str, Any]:
 
 
 def _rows(dataset: io.Dataset, evaluation: Evaluation) -> Iterable[tuple[str, Any, Any, Any]]:
-    """Rows of the sheet, what is visible of the object: at most 24, spread over all views and prompts."""
+    """Rows of the sheet with the visible part of the object: at most 24, spread over all views and prompts."""
     keys = list(dataset.truths)
     chosen = np.unique(np.linspace(0, len(keys) - 1, _MOST_ROWS).astype(int))
     images = dict(zip(dataset.test.names, dataset.test.images))

@@ -127,7 +127,7 @@ def reconstruct(
 
 
 def _name_of(views: Path) -> str:
-    """Name of the folder of a capture, by which its results are told from those of others."""
+    """Name of the folder of a capture, by which its results differ from those of others."""
     from pigjax import io
 
     home = views.resolve() if views.is_dir() else views.resolve().parent
@@ -136,7 +136,7 @@ def _name_of(views: Path) -> str:
 
 
 def _settings(tau_t: float, tau_d: float, weighting: str, purity: float, min_seen: float | None) -> dict[str, Any]:
-    """Of the vote; what competes with objects by alpha·T is the background too."""
+    """Settings of the vote; with alpha·T the background competes too."""
     background = "vote" if weighting == "alpha" else "ignore"
     thresholds = {"tau_T": tau_t, "tau_d": tau_d, "purity": purity, "min_seen": min_seen}
     return {**thresholds, "weighting": weighting, "background": background}

@@ -44,7 +44,7 @@ def turntable(
         up: axis of the world that points up: x, y, z, -x, -y or -z.
         background: grey level.
         fps: frames a second.
-        progress: told frames done and frames to do.
+        progress: called with frames done and frames to do.
 
     Returns:
         The cameras.

@@ -52,7 +52,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def fits(value: Any, hint: Any) -> bool:
-    """Whether a value is of the kind that an annotation names; what this module cannot tell passes."""
+    """Whether a value is of the kind that an annotation names; annotations that this module cannot judge pass."""
     if hint is Any:
         return True
     origin = get_origin(hint)
@@ -90,7 +90,7 @@ def _is_sequence(value: Any) -> bool:
 
 
 def _members_fit(value: Any, hint: Any) -> bool:
-    """Whether what a list, a tuple of any length or a mapping holds is of the kind that the annotation names."""
+    """Whether the members of a list, a tuple of any length or a mapping are of the kind that the annotation names."""
     members = get_args(hint)
     if isinstance(value, Mapping) and len(members) == 2:
         return all(fits(member, members[1]) for member in value.values())

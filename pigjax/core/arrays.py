@@ -40,7 +40,7 @@ def is_known(*trees: Any) -> bool:
 
 
 def in_precision(tree: Any, dtype: Any) -> Any:
-    """The same tree with its real arrays in a precision: what is computed has that of the Gaussians or particles."""
+    """The same tree with its real arrays in a precision, that of the Gaussians or particles."""
 
     def converted(leaf):
         real = isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.floating)

@@ -220,7 +220,7 @@ def orbit(
     around = np.cos(azimuth)[:, None] * first + np.sin(azimuth)[:, None] * np.cross(above, first)
     eyes = np.asarray(target) + radius * (np.cos(elevation) * around + np.sin(elevation) * above)
     look = partial(look_at, target=target, focal=focal, width=width, height=height)
-    # seen from a pole, the axis is the line of sight; the meridian goes on into what is up there
+    # seen from a pole, the axis is the line of sight; the meridian continues into the upward direction
     poles = abs(np.cos(elevation)) < _ALONG
     ups = -np.sign(np.sin(elevation)) * around if poles else np.broadcast_to(above, eyes.shape)
     return stack_cameras([look(eye, up=top) for eye, top in zip(eyes, ups)])

@@ -93,7 +93,7 @@ LARGEST_WHOLE = 2**31 - 1  # of the integers that arrays hold
 
 
 def check_fields(thing: Any) -> None:
-    """Check every number and choice of a dataclass against its annotation and what `limits`, `choices` say of it.
+    """Check every number and choice of a dataclass against its annotation, `limits` and `choices`.
 
     Numbers without limits must be finite. Arrays that are traced pass.
 

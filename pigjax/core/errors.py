@@ -1,4 +1,4 @@
-"""What goes wrong at the edge: one sentence that names the file or field, the value and the remedy."""
+"""Exceptions at the API boundary: one sentence that names the file or field, the value and the remedy."""
 
 
 class InputError(ValueError):

@@ -11,12 +11,12 @@ SH_CONSTANT = 0.28209479177387814  # the spherical harmonic of degree 0, 1 / (2 
 
 
 class Gaussians(eqx.Module):
-    """Trainable 3D Gaussians, parametrised as in 3DGS."""
+    """Trainable 3D Gaussians, parametrised as in 3DGS (Kerbl et al. 2023)."""
 
     means: Float[Array, "n 3"] = array_field()  # [m]
     log_scales: Float[Array, "n 3"] = array_field()  # log of standard deviations in m
     quats: Float[Array, "n 4"] = array_field()  # wxyz, any length; zero means no rotation
-    logit_opacities: Float[Array, "n"] = array_field()
+    logit_opacities: Float[Array, "n"] = array_field()  # sigmoid gives the opacity in (0, 1)
     sh: Float[Array, "n k 3"] = array_field()  # spherical harmonics, k = (degree + 1)²
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""Arrays, tables and figures on disk: `.npy`, `.npz`, `.csv`, `.parquet`, and what matplotlib draws."""
+"""Arrays, tables and figures on disk: `.npy`, `.npz`, `.csv`, `.parquet`, and figures of matplotlib."""
 
 from __future__ import annotations
 
@@ -68,8 +68,8 @@ def load_arrays(
     Args:
         path: of the file.
         what: the kind of file, for messages: "table".
-        remedy: what the reader of a message can do.
-        check: told {name: ArrayHeader} before any array is read; what it raises comes through.
+        remedy: advice to the reader of a message.
+        check: told {name: ArrayHeader} before any array is read; its exceptions are passed on.
         prefixes: arrays whose names begin with none of these are not read.
 
     Raises:

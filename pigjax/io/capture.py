@@ -1,4 +1,4 @@
-"""What every camera format comes down to: one `Shot` per photo, with the checks that they share."""
+"""The common form of all camera formats: one `Shot` per photo, with shared checks."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Capture:
     root: Path  # folder in which `object_mask` lies
     shots: tuple[Shot, ...]
     points: Path | None
-    remarks: tuple[str, ...] = ()  # of what the file says and nothing here applies, for a warning
+    remarks: tuple[str, ...] = ()  # on fields of the file that nothing here applies, for a warning
 
 
 def normal_path(name: str) -> str:

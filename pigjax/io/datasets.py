@@ -37,7 +37,7 @@ class Dataset(NamedTuple):
 
 
 class _Truths(NamedTuple):
-    """What each layout comes down to."""
+    """The common form of all layouts."""
 
     test: list[str]  # views that must not vote
     masks: dict[tuple[str, str], Truth]
@@ -61,7 +61,7 @@ def load_dataset(
       eighth where there is no such folder. A mask is where a pixel is > 128.
     - "3d-ovs" (Liu et al. 2023): `segmentations/classes.txt` and `segmentations/<number>/<class>.png`, where the number
       counts the files in `images` in the order of names. A mask is where a pixel is 255.
-    - "views": any posed photos; truth is what `object_mask` holds in the test split, with the names of `names.json`
+    - "views": any posed photos; truth is `object_mask` of the test split, with the names of `names.json`
       {id: name}.
 
     Pictures of zeros and ones are masks as well. Views with truth never vote. As in Gaussian Grouping's data, where

@@ -61,7 +61,7 @@ def decoding(path: PathLike, what: str, *, remedy: str = "copy or export it agai
     Args:
         path: the file, which the message names.
         what: the kind of file: "PLY file", "mask".
-        remedy: what the reader of the message can do.
+        remedy: advice to the reader of the message.
 
     Raises:
         InputError: the block raised anything but an InputError.
@@ -155,7 +155,7 @@ def writing(path: PathLike) -> Iterator[Path]:
 
 
 def write_text(path: PathLike, text: str) -> None:
-    """Write a text file in UTF-8, whole or not at all; what UTF-8 cannot hold becomes U+FFFD.
+    """Write a text file in UTF-8, whole or not at all; characters beyond UTF-8 become U+FFFD.
 
     Raises:
         InputError: the file cannot be written.
@@ -165,7 +165,7 @@ def write_text(path: PathLike, text: str) -> None:
 
 
 def write_toml(path: PathLike, content: Any) -> None:
-    """Write nested dicts of strings, numbers and lists as TOML; what UTF-8 cannot hold becomes U+FFFD, with a warning.
+    """Write nested dicts of strings, numbers and lists as TOML; characters beyond UTF-8 become U+FFFD, with a warning.
 
     Raises:
         InputError: the file cannot be written, or something in it has no TOML form.
@@ -190,7 +190,7 @@ def output_folder(path: PathLike, *, files: Sequence[str] = (), folders: Sequenc
         folders: names of folders that will be made in it.
 
     Raises:
-        InputError: a file is in its place, a folder is in the place of one of its files or the other way round, or it
+        InputError: a file is in its place, a folder is in the place of one of its files or vice versa, or it
             cannot be made or written.
     """
     path = Path(path)

@@ -143,7 +143,7 @@ def write_image(path: PathLike, image: Picture) -> None:
         image: [h w 3], [h w 4] or [h w].
 
     Raises:
-        InputError: what is no picture, the suffix names no picture format, or the file cannot be written.
+        InputError: an array is no picture, the suffix names no picture format, or the file cannot be written.
     """
     values = to_uint8(image, name=f"{path}: image")
     if not (values.ndim == 2 or (values.ndim == 3 and values.shape[-1] in (3, 4))):

@@ -44,7 +44,7 @@ def save_labels(
         votes: views, or sums of alpha·T, for each id.
         confidence: share of the votes that the winner took, 0 to 1.
         ids: id of each column of `votes`; None: column k counts id k.
-        scene: of `digest_of_scene`, by which labels of other Gaussians are told; None: they cannot be told.
+        scene: of `digest_of_scene`, to recognise labels of other Gaussians; None: they are not recognised.
 
     Raises:
         InputError: the file cannot be written.

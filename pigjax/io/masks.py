@@ -120,7 +120,7 @@ def save_masks(folder: PathLike, names: Sequence[str], masks: Integer[np.ndarray
 def _finder(
     folder: PathLike, names: Sequence[str], frames: Sequence[str], id_field: str | None
 ) -> Callable[[str], Path | Segments | None]:
-    """What gives the file, or the annotations, of a view."""
+    """A function that gives the file, or the annotations, of a view."""
     if Path(folder).suffix.lower() == ".json":
         return read_views(existing(folder, "JSON of masks"), frames, id_field).get
     folder = existing_folder(folder, "folder of masks")

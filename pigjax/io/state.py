@@ -25,7 +25,7 @@ from pigjax.io.files import PathLike, decoding, existing, writing
 from pigjax.io.provenance import Parts, check_same
 
 _SIGNATURE = "signature"
-STATES = "[0-9]" * 6 + "*.npz"  # pattern of what `save_state` leaves, and not of other files
+STATES = "[0-9]" * 6 + "*.npz"  # pattern of files of `save_state`, and of no others
 Tree = TypeVar("Tree")
 
 
@@ -34,7 +34,7 @@ def save_state(
 ) -> Path:
     """Write the arrays of one frame as `<frame>.npz`, whole or not at all, and give its path. Host.
 
-    `signature` says what run they belong to (a hash of the scene and its sizes).
+    `signature` names the run that they belong to (a hash of the scene and its sizes).
 
     Raises:
         InputError: an array is named "signature", or the folder cannot be written.
@@ -120,7 +120,7 @@ def save_pytree(path: PathLike, tree: Any, *, parts: Parts | None = None) -> Non
     Args:
         path: of the file.
         tree: arrays and numbers.
-        parts: of `provenance.parts_of`, what the leaves were made from; None: they depend on nothing.
+        parts: of `provenance.parts_of`, the inputs of the leaves; None: there are none.
 
     Raises:
         InputError: the file cannot be written.
@@ -165,12 +165,12 @@ def _checksum(parts: Parts, payload: bytes) -> str:
 def resumed(path: PathLike, like: Tree, *, parts: Parts, overwrite: bool = False) -> Tree | None:
     """The tree of a checkpoint; None where there is none or it is damaged, so that all is computed again. Host.
 
-    A damaged file is told in a warning and moved aside, to the same name with ".damaged".
+    A damaged file causes a warning and is renamed to the same name with ".damaged".
 
     Args:
         path: of the checkpoint.
         like: as for `load_pytree`.
-        parts: what a checkpoint must have been made from.
+        parts: the inputs that a checkpoint must have.
         overwrite: take a checkpoint of other parts for none instead of refusing it.
 
     Raises:
@@ -190,7 +190,7 @@ def resumed(path: PathLike, like: Tree, *, parts: Parts, overwrite: bool = False
 
 
 def set_aside(path: PathLike, error: InputError) -> None:
-    """Move a damaged file out of the way, and warn."""
+    """Rename a damaged file, and warn."""
     path = Path(path)
     aside = path.with_name(path.name + ".damaged")
     warnings.warn(f"{error} It is kept as {aside.name}, and what it held is computed again.", stacklevel=3)

@@ -20,7 +20,7 @@ from pigjax.mpm.active_grid import LARGEST
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.materials import MaterialTable
 
-_COST_OF_IMPLICIT = 400  # explicit steps in the time of an implicit one, by benchmarks/bench_implicit.py
+_COST_OF_IMPLICIT = 400  # explicit steps in the time of an implicit one, by benchmarks/implicit.py
 _MOST_SUBSTEPS = 2.0**31
 Vector = Float[Array, "3"] | Sequence[float | int] | np.ndarray
 

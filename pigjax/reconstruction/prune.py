@@ -47,7 +47,7 @@ def prune(
 ) -> Gaussians:
     """The `budget` Gaussians that contribute most to these views, in their old order. Host.
 
-    `benchmarks/bench_prune.py` measures what that costs in picture quality, and what it saves in time.
+    `python -m benchmarks prune` measures what that costs in picture quality, and what it saves in time.
 
     Raises:
         InputError: the budget is below 1.

@@ -1,4 +1,4 @@
-"""From a scene file to what will be simulated and drawn: nothing here that the scene does not ask for."""
+"""From a scene file to its particles, colliders, cameras and settings: nothing that the scene does not ask for."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Inputs:
 
 @dataclass
 class Plan:
-    """What will be simulated."""
+    """Inputs of the simulation."""
 
     particles: Particles
     table: MaterialTable
@@ -57,7 +57,7 @@ class Plan:
     config: SimConfig
     clamp: ClampParams
     frame_dt: float  # [s]
-    labels: Labels  # with what is buried in still objects given to them
+    labels: Labels  # Gaussians buried in still objects belong to these
 
 
 def read_inputs(scene: Scene) -> Inputs:
@@ -237,7 +237,7 @@ def _still_solids(scene: Scene, inputs: Inputs, labels: Labels) -> dict[str, Col
 def _without_buried(inputs: Inputs, labels: Labels, solids: dict[str, Collider], dx: float) -> Labels:
     """Labels in which Gaussians deeper than a quarter of a cell in a still object belong to it.
 
-    Nobody saw what lies between an object and what it stands on, so ids there are guesses; matter that starts inside
+    No view saw the gap between an object and its support, so ids there are guesses; matter that starts inside
     a collider could only be stuck.
     """
     for name, solid in solids.items():

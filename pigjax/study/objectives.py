@@ -1,6 +1,6 @@
-"""What a study may score: pure functions of an `Outcome`, each a dictionary of scalars.
+"""Objectives of studies: pure functions of an `Outcome`, each a dictionary of scalars.
 
-One of them named "loss" is what tuning makes small. Where the simulation broke down or left its grid, all are NaN.
+Tuning minimises the scalar named "loss". Where the simulation broke down or left its grid, all are NaN.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Objective = Callable[[Outcome], Scores]
 
 
 def motion(outcome: Outcome) -> Scores:
-    """Where each object is at the end [m], how fast [m/s], and the health of the simulation."""
+    """Place [m] and speed [m/s] of each object at the end, and the health of the simulation."""
     scores: Scores = {}
     particles, health = outcome.particles, outcome.health
     for name, rows in outcome.experiment.rows:
@@ -125,7 +125,7 @@ def video(outcome: Outcome, *, target: Float[Array, "t h w 3"], levels: int = 1)
 def pyramid_error(seen: Float[Array, "t h w 3"], target: Float[Array, "t h w 3"], levels: int) -> Float[Array, ""]:
     """Sum of the mean squared differences of two videos at full size, half of it, and so on, `levels` sizes in all.
 
-    What is drawn beside where it should be, without touching it, has a slope in the small pictures only.
+    An object drawn beside its true place, without touching it, has a slope in the small pictures only.
     """
     difference, total = seen - target, jnp.zeros((), seen.dtype)
     for _ in range(levels):
@@ -169,7 +169,7 @@ def _healthy(objective: Objective, outcome: Outcome) -> Scores:
 
 
 def _scores(objective: Objective, outcome: Outcome) -> Scores:
-    """Scores of an objective; what its own code raises is told with file and line."""
+    """Scores of an objective; exceptions of its own code are reported with file and line."""
     function = objective.func if isinstance(objective, partial) else objective
     file = getattr(getattr(function, "__code__", None), "co_filename", "")
     if function in OBJECTIVES.values():
@@ -209,7 +209,7 @@ def _from_file(path: Path, name: str) -> Callable[..., Scores]:
 
 @contextmanager
 def _running(path: Path) -> Iterator[None]:
-    """Turn what the code of a study raises into one sentence with its file and line.
+    """Turn exceptions of a study's code into one sentence with its file and line.
 
     Raises:
         InputError: the block raised any exception but an InputError.

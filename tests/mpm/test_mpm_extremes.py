@@ -1,6 +1,6 @@
 """MLS-MPM at its extremes: what is not healthy is counted by name or refused, and harms nothing else.
 
-Most tests share one compiled rollout: 64 particles of two materials for 40 steps. `benchmarks/bench_stability.py` does
+Most tests share one compiled rollout: 64 particles of two materials for 40 steps. `python -m benchmarks stability` does
 the same for every law and prints how large the errors are.
 """
 

@@ -1,4 +1,4 @@
-"""Bounds of parameters, kept by a smooth change of variables: what is optimised is free, what is used never leaves."""
+"""Bounds of parameters, kept by a smooth change of variables: optimised numbers are free, used ones in bounds."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _EDGE = 1e-6  # share of the range, or absolute where there is one end, that a s
 
 @dataclass(frozen=True)
 class Bounds:
-    """Where a parameter may go: ends for all of its components or one for each, None where there is none.
+    """Range of a parameter: ends for all of its components or one for each, None where there is none.
 
     Two ends are kept by a sigmoid, one by a softplus. With scale = "log" steps multiply instead of adding, which suits
-    what spans decades, as Young's modulus does; it then must be > 0.
+    parameters that span decades, as Young's modulus does; they then must be > 0.
 
     Raises:
         InputError: the lower end is not below the upper one, or an end of a logarithmic scale is not > 0.
     """
 
-    low: End = None
-    high: End = None
-    scale: Literal["linear", "log"] = "linear"
+    low: End = None  # in the unit of the parameter
+    high: End = None  # in the unit of the parameter
+    scale: Literal["linear", "log"] = "linear"  # of the steps
 
     def __post_init__(self):
         if self.scale not in ("linear", "log"):

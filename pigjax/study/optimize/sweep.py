@@ -57,12 +57,12 @@ def sweep(
             list of sets of parameters, pytrees of one structure.
         mesh: of one axis, over which a batch is shared out; all devices of all processes by default.
         batch: rows at once; by default 32 for each device, or fewer if memory is short.
-        resume: folder where finished batches are kept, so that a killed sweep goes on.
-        shared: what all rows share, a pytree of arrays. What `fn` closes over instead is compiled into the program.
+        resume: folder where finished batches are kept, so that a killed sweep resumes.
+        shared: inputs of all rows, a pytree of arrays. Arrays that `fn` closes over are compiled into the program.
         check: raises InputError for parameters that cannot be (host).
         vectorize: False calls `fn` row after row outside of jit, for functions that no one can trace; what they raise
             for bad input or a broken simulation marks the row.
-        callback: told rows done and rows to do after each batch.
+        callback: called with rows done and rows to do after each batch.
         mark: what the results depend on beside `fn` (its code and what it closes over), the parameters and `shared`,
             as a mapping by name or any value: files that `fn` reads, for example.
         overwrite: replace rows in `resume` that were made from something else, instead of refusing them.
@@ -244,7 +244,7 @@ class _Program:
         self.compiled = jax.jit(mapped).lower(self._take([0]), self.shared).compile()
 
     def rows_that_fit(self) -> int:
-        """Rows that memory holds, by what the compiled program needs."""
+        """Rows that memory holds, by the memory of the compiled program."""
         need = self.compiled.memory_analysis()
         if need is None:
             return self.size
