@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
 from pigjax.arguments import checked
-from pigjax.arrays import array_field, einsum
+from pigjax.arrays import array_field, einsum, real_field
 from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.colliders import Collider
 from pigjax.errors import InputError
@@ -33,8 +33,8 @@ class Binding(eqx.Module):
 
     gaussian: Int[Array, "m"] = array_field()
     particles: Int[Array, "m k"] = array_field()
-    weights: Float[Array, "m k"] = array_field()  # sum to 1
-    offsets: Float[Array, "m k 3"] = array_field()  # from each particle to the Gaussian, at rest [m]
+    weights: Float[Array, "m k"] = real_field()  # sum to 1
+    offsets: Float[Array, "m k 3"] = real_field()  # from each particle to the Gaussian, at rest [m]
 
     def __len__(self) -> int:
         return self.gaussian.shape[0]

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, Integer, Num
 from scipy.spatial import cKDTree
 
 from pigjax.arguments import checked
-from pigjax.arrays import array_field, in_precision
+from pigjax.arrays import array_field, in_precision, real_field
 from pigjax.camera import Camera
 from pigjax.chunks import static_capacity
 from pigjax.errors import InputError
@@ -41,7 +41,7 @@ class Labels(eqx.Module):
 
     object_id: Int[Array, "n"] = array_field()  # 0 = background or contested, -1 = never seen
     votes: Num[Array, "n m"] = array_field()  # views (or alpha·T, or soft counts) for each id, background in column 0
-    confidence: Float[Array, "n"] = array_field()  # share of the votes that the winner took, 0 where never seen
+    confidence: Float[Array, "n"] = real_field()  # share of the votes that the winner took, 0 where never seen
     overflow: Int[Array, ""] | None = None  # box/tile pairs that the renderer dropped, over all views
     ids: Int[Array, "m"] | None = None  # id of each column of `votes`; None: column k counts id k
 

@@ -13,10 +13,10 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from pigjax.arguments import checked
-from pigjax.arrays import array_field, einsum, in_precision, static_field
+from pigjax.arrays import einsum, in_precision, real_field, static_field
 from pigjax.bands import collect, spread
 from pigjax.camera import Camera, require_one, stack_cameras, to_camera
-from pigjax.checks import LARGEST_WHOLE, Limits, check_fields
+from pigjax.checks import LARGEST_WHOLE, Limits, check_axes, check_fields
 from pigjax.errors import InputError
 from pigjax.extent import Extent, scene_extent, typical_distance
 from pigjax.linalg import quat_to_matrix, safe_normalize, svd
@@ -25,28 +25,40 @@ from pigjax.tiles import blend
 
 
 class Gaussians(eqx.Module):
-    """Trainable 3D Gaussians, parametrised as in 3DGS."""
+    """Trainable 3D Gaussians, parametrised as in 3DGS.
 
-    means: Float[Array, "n 3"] = array_field()  # [m]
-    log_scales: Float[Array, "n 3"] = array_field()  # log of standard deviations in m
-    quats: Float[Array, "n 4"] = array_field()  # wxyz, any length; zero means no rotation
-    logit_opacities: Float[Array, "n"] = array_field()
-    sh: Float[Array, "n k 3"] = array_field()  # spherical harmonics, k = (degree + 1)²
+    Raises:
+        InputError: an array has not its axes, or is not as long as the others.
+    """
+
+    means: Float[Array, "n 3"] = real_field()  # [m]
+    log_scales: Float[Array, "n 3"] = real_field()  # log of standard deviations in m
+    quats: Float[Array, "n 4"] = real_field()  # wxyz, any length; zero means no rotation
+    logit_opacities: Float[Array, "n"] = real_field()
+    sh: Float[Array, "n k 3"] = real_field()  # spherical harmonics, k = (degree + 1)²
+
+    def __check_init__(self):
+        check_axes(self)
 
     def __len__(self) -> int:
         return self.means.shape[0]
 
 
 class Splats(eqx.Module):
-    """Posed Gaussians, ready to draw: covariance = factors @ factorsᵀ."""
+    """Posed Gaussians, ready to draw: covariance = factors @ factorsᵀ.
 
-    means: Float[Array, "n 3"] = array_field()  # [m]
-    factors: Float[Array, "n 3 3"] = array_field()  # [m]
-    opacities: Float[Array, "n"] = array_field()  # in [0, 1]
-    sh: Float[Array, "n k 3"] = array_field()
-    sh_rotations: Float[Array, "n 3 3"] | None = array_field(
-        default=None
-    )  # turns view-dependent colour with the matter
+    Raises:
+        InputError: an array has not its axes, or is not as long as the others.
+    """
+
+    means: Float[Array, "n 3"] = real_field()  # [m]
+    factors: Float[Array, "n 3 3"] = real_field()  # [m]
+    opacities: Float[Array, "n"] = real_field()  # in [0, 1]
+    sh: Float[Array, "n k 3"] = real_field()
+    sh_rotations: Float[Array, "n 3 3"] | None = real_field(default=None)  # turns view-dependent colour with the matter
+
+    def __check_init__(self):
+        check_axes(self)
 
     def __len__(self) -> int:
         return self.means.shape[0]

@@ -12,7 +12,8 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from pigjax.arguments import checked
-from pigjax.arrays import array_field, static_field
+from pigjax.arrays import array_field, real_field, static_field
+from pigjax.checks import LARGEST_WHOLE, Limits, check_axes, check_fields
 from pigjax.errors import InputError
 from pigjax.materials import MaterialTable
 
@@ -25,20 +26,26 @@ class Particles(eqx.Module):
     """Material points of one simulation (paper 3.1.2), in any order of materials.
 
     `x` turns NaN for a particle whose state is no longer finite; such a particle takes no further part.
+
+    Raises:
+        InputError: an array has not its axes, or is not as long as the others.
     """
 
-    x: Float[Array, "p 3"] = array_field()  # position [m]
-    v: Float[Array, "p 3"] = array_field()  # velocity [m/s]
-    F: Float[Array, "p 3 3"] = array_field()  # elastic deformation gradient
-    C: Float[Array, "p 3 3"] = array_field()  # velocity gradient, by APIC [1/s]
-    F_visual: Float[Array, "p 3 3"] = array_field()  # total deformation, for drawing
-    volume0: Float[Array, "p"] = array_field()  # at rest [m³]
-    mass: Float[Array, "p"] = array_field()  # [kg]
+    x: Float[Array, "p 3"] = real_field()  # position [m]
+    v: Float[Array, "p 3"] = real_field()  # velocity [m/s]
+    F: Float[Array, "p 3 3"] = real_field()  # elastic deformation gradient
+    C: Float[Array, "p 3 3"] = real_field()  # velocity gradient, by APIC [1/s]
+    F_visual: Float[Array, "p 3 3"] = real_field()  # total deformation, for drawing
+    volume0: Float[Array, "p"] = real_field()  # at rest [m³]
+    mass: Float[Array, "p"] = real_field()  # [kg]
     material: Int[Array, "p"] = array_field()  # row of the material table
-    hardening: Float[Array, "p"] = array_field()  # internal variable of the plastic laws
+    hardening: Float[Array, "p"] = real_field()  # internal variable of the plastic laws
     gaussian: Int[Array, "p"] = array_field()  # index of the Gaussian it carries, -1 for none
     body: Int[Array, "p"] = array_field()  # what `BodyContact` keeps apart
     counts: tuple[int, ...] = static_field()  # particles of each row, which sizes the groups by law
+
+    def __check_init__(self):
+        check_axes(self)
 
     def __len__(self) -> int:
         return self.x.shape[0]
@@ -52,17 +59,14 @@ class Grid(eqx.Module):
             finite.
     """
 
-    origin: Float[Array, "3"] = array_field()  # first node [m]
-    dx: Float[Array, ""] = array_field()  # [m]
-    shape: tuple[int, int, int] = static_field()
+    origin: Float[Array, "3"] = real_field()  # first node [m]
+    dx: Float[Array, ""] = real_field(limits=Limits(0, above=True, unit="m"))
+    shape: tuple[int, int, int] = static_field(limits=Limits(1, LARGEST_WHOLE))
 
     def __check_init__(self):
+        check_fields(self)
         if min(self.shape) < 2 * WALL + 2:
             raise InputError(f"Grid.shape = {self.shape}: every side needs {2 * WALL + 2} nodes or more.")
-        if _is_known(self.dx) and not np.all(np.isfinite(self.dx) & (np.asarray(self.dx) > 0)):
-            raise InputError(f"Grid.dx = {self.dx}: the grid spacing must be > 0 m, and finite.")
-        if _is_known(self.origin) and not np.isfinite(self.origin).all():
-            raise InputError(f"Grid.origin = {self.origin}: the first node must have finite coordinates.")
 
     @property
     def points(self) -> Float[Array, "nx ny nz 3"]:
