@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float, UInt8
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, UnidentifiedImageError
 
 from pigjax.arguments import checked
 from pigjax.errors import InputError
@@ -18,7 +18,7 @@ from pigjax.io.files import PathLike, decoding, existing, writing
 _ORIENTATION = 0x0112  # EXIF tag: 1 as stored, 2 to 4 mirrored or upside down, 5 to 8 width and height exchanged
 _SIDEWAYS = 5
 # that photos and masks have; others are refused, of which some start programs (EPS: Ghostscript) or read other files
-_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "AVIF", "TIFF", "BMP", "DIB", "GIF", "PPM", "TGA", "JPEG2000")
+_FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "TIFF", "BMP", "DIB", "GIF", "PPM", "TGA", "JPEG2000")
 _MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX")
 Background = float | int | tuple[float, float, float]
 # [h w 3] or [h w]; sizes have no names, so that a bad frame meets our own message rather than a type checker's.
@@ -48,7 +48,7 @@ def open_image(path: PathLike, *, check: Callable[[int, int], None] | None = Non
         InputError: the file is not a picture, is damaged, or holds several pictures, or `check` says so.
     """
     path = existing(path, "image")
-    with _decoding(path), Image.open(path, formats=_FORMATS) as image:
+    with _decoding(path), _opened(path) as image:
         if check is not None:
             check(*image.size)
         if getattr(image, "is_animated", False) and image.format != "MPO":  # a phone's second picture is a preview
@@ -65,8 +65,18 @@ def image_size(path: PathLike) -> tuple[int, int]:
         InputError: the file is not a picture.
     """
     path = existing(path, "image")
-    with _decoding(path), Image.open(path, formats=_FORMATS) as image:
+    with _decoding(path), _opened(path) as image:
         return image.size
+
+
+def _opened(path: PathLike) -> Image.Image:
+    """A picture of a known format, whatever the name of its file says."""
+    Image.init()
+    known = [name for name in _FORMATS if name in Image.OPEN]  # Pillow may be built without some
+    try:
+        return Image.open(path, formats=known)
+    except UnidentifiedImageError:
+        raise ValueError(f"none of {', '.join(known)}") from None
 
 
 @contextmanager
@@ -124,7 +134,7 @@ def turned_by_exif(path: PathLike) -> bool:
         InputError: the file is not a picture.
     """
     path = existing(path, "image")
-    with _decoding(path), Image.open(path, formats=_FORMATS) as image:
+    with _decoding(path), _opened(path) as image:
         orientation = image.getexif().get(_ORIENTATION, 1)
         return 1 < orientation < _SIDEWAYS or (_SIDEWAYS <= orientation <= 8 and image.width == image.height)
 
