@@ -316,7 +316,9 @@ def _require_image(function: str, focal: float, width: int, height: int) -> None
     if _known(focal) and not 0 < float(focal) < np.inf:
         raise InputError(f"{function}: focal = {focal}: must be finite and > 0 px.")
     if not all(isinstance(side, Integral) and not isinstance(side, bool) and side >= 1 for side in (width, height)):
-        raise InputError(f"{function}: width, height = {width}, {height}: an image has at least one pixel, and whole ones.")
+        raise InputError(
+            f"{function}: width, height = {width}, {height}: whole numbers are needed, at least one pixel."
+        )
 
 
 def _known(value) -> bool:

@@ -70,7 +70,7 @@ def file_digest(path: PathLike) -> str:
         InputError: it cannot be read.
     """
     path = Path(path)
-    if not path.exists():
+    if not os.path.exists(path):
         return "missing"
     hasher = hashlib.blake2b(digest_size=8)
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())

@@ -283,7 +283,8 @@ def _only_named(inputs: Inputs, plan: Plan) -> tuple[Inputs, Plan]:
     object_id = np.asarray(plan.labels.object_id)
     kept = np.isin(object_id, [0, *inputs.ids.values()])
     row = jnp.asarray(np.cumsum(kept) - 1)
-    labels = jax.tree.map(lambda column: column[kept] if column.ndim else column, plan.labels)
+    own = {name: getattr(plan.labels, name)[kept] for name in ("object_id", "votes", "confidence")}
+    labels = replace(plan.labels, **own)
     carried = plan.particles.gaussian
     particles = replace(plan.particles, gaussian=jnp.where(carried >= 0, row[carried], -1).astype(carried.dtype))
     binding = plan.binding
