@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from pigjax.arguments import checked
 from pigjax.arrays import Vector, einsum, in_precision, matmul, real_field, static_field
-from pigjax.checks import LARGEST_WHOLE, Limits, check_fields
+from pigjax.checks import Limits, check_fields
 from pigjax.errors import InputError
 from pigjax.linalg import quat_to_matrix
 
@@ -35,8 +35,8 @@ class Camera(eqx.Module):
     world_to_cam: Float[Array, "*batch 4 4"] = real_field(limits=Limits(nan=True))
     focal: Float[Array, "*batch 2"] = real_field(limits=Limits(0, above=True, unit="px"))
     centre: Float[Array, "*batch 2"] = real_field()  # principal point [px]
-    width: int = static_field(limits=Limits(1, LARGEST_WHOLE, unit="px"))
-    height: int = static_field(limits=Limits(1, LARGEST_WHOLE, unit="px"))
+    width: int = static_field(limits=Limits(1, 65536, unit="px"))
+    height: int = static_field(limits=Limits(1, 65536, unit="px"))
 
     def __check_init__(self):
         arrays = (self.world_to_cam, self.focal, self.centre)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, UInt8
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from pigjax.arguments import checked
+from pigjax.checks import Limits, shown
 from pigjax.errors import InputError
 from pigjax.io.files import PathLike, decoding, existing, writing
 
@@ -103,8 +104,11 @@ def open_rgb(
 
     Raises:
         MissingFileError: there is no such file.
-        InputError: the file is not an 8-bit picture, is damaged, or has another size.
+        InputError: the file is not an 8-bit picture, is damaged, or has another size, or the background is no colour.
     """
+
+    if (rule := Limits(0, 1).broken(background)) is not None:
+        raise InputError(f"{path}: background = {shown(background)}: {rule}.")
 
     def check(*stored: int) -> None:
         if size is not None and size not in (stored, stored[::-1]):
