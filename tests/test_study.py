@@ -19,14 +19,11 @@ from pigjax import io
 from pigjax.camera import look_at, stack_cameras
 from pigjax.cli import app
 from pigjax.errors import InputError, MissingFileError, SceneError
-from pigjax.materials import Material, material_table
-from pigjax.matter import make_particles
 from pigjax.scene import load_scene, run_scene, scene_from
-from pigjax.scene.plan import Inputs, Plan
 from pigjax.segmentation import Labels, lift_masks
-from pigjax.splat import Gaussians, RenderConfig, render
+from pigjax.splat import RenderConfig, render
 from pigjax.study import Voting, experiment, load_study, sweep_study, tune_study
-from pigjax.study.experiment import _only_named
+from pigjax.study.experiment import _of_some
 from pigjax.study.objectives import pyramid_error, video
 from pigjax.tune import load_table
 
@@ -394,14 +391,8 @@ def test_next_to_no_soft_votes_make_next_to_no_object():
 
 
 def test_only_keeps_labels_that_name_their_columns():
-    table = material_table([Material(model="fixed_corotated", density=1.0, young=1.0, poisson=0.1)])
-    cloud = Gaussians(np.zeros((3, 3)), np.zeros((3, 3)), np.ones((3, 4)), np.zeros(3), np.zeros((3, 1, 3)))
     labels = Labels(jnp.array([5, 9, 5]), jnp.ones((3, 2)), jnp.ones(3), ids=jnp.array([5, 9]))
-    particles = make_particles(np.zeros((2, 3)), volume=1.0, table=table, gaussian=np.array([0, 2]))
-    unused = dict.fromkeys(("table", "colliders", "contact", "sleep", "gravity", "config", "clamp", "frame_dt"))
-    plan = Plan(particles=particles, labels=labels, binding=None, **unused)
-    inputs, plan = _only_named(Inputs(cloud, None, {"duck": 5}, {}), plan)
-    assert len(inputs.gaussians) == 2
-    np.testing.assert_array_equal(plan.labels.object_id, [5, 5])
-    np.testing.assert_array_equal(plan.labels.ids, [5, 9])
-    np.testing.assert_array_equal(plan.particles.gaussian, [0, 1])
+    some = _of_some(labels, np.array([True, False, True]))
+    np.testing.assert_array_equal(some.object_id, [5, 5])
+    np.testing.assert_array_equal(some.ids, [5, 9])
+    assert some.votes.shape == (2, 2)

@@ -8,6 +8,7 @@ import re
 import shutil
 import tomllib
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -310,8 +311,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Entries of a JSON object, where a key that is written twice would hide the first value."""
     entries = dict(pairs)
     if len(entries) < len(pairs):
-        seen: set[str] = set()
-        twice = next(key for key, _ in pairs if key in seen or seen.add(key))
+        twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
         raise ValueError(f"the key {twice[:40]!r} is written twice")
     return entries
 
