@@ -115,7 +115,9 @@ def _id_of(name: str, names: dict[int, str]) -> int:
         return found
     if name.isascii() and name.isdecimal() and len(name) <= 10:
         return int(name)
-    raise InputError(f"--remove {name}: {suggest(name, list(names.values())) if names else 'give its id, or names'}.")
+    raise InputError(
+        f"--remove {name[:40]}: {suggest(name, list(names.values())) if names else 'give its id, or names'}."
+    )
 
 
 def _remove(

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import array_field, einsum
+from pigjax.core.arrays import array_field, einsum, real_field
 from pigjax.core.errors import InputError
 from pigjax.coupling.seeding import object_ids
 from pigjax.mpm import Particles, Trajectory
@@ -26,8 +26,8 @@ class Binding(eqx.Module):
 
     gaussian: Int[Array, "m"] = array_field()
     particles: Int[Array, "m k"] = array_field()
-    weights: Float[Array, "m k"] = array_field()  # sum to 1
-    offsets: Float[Array, "m k 3"] = array_field()  # from each particle to the Gaussian, at rest [m]
+    weights: Float[Array, "m k"] = real_field()  # sum to 1
+    offsets: Float[Array, "m k 3"] = real_field()  # from each particle to the Gaussian, at rest [m]
 
     def __len__(self) -> int:
         return self.gaussian.shape[0]

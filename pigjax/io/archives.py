@@ -79,6 +79,8 @@ def load_arrays(
     path = existing(path, what)
     with decoding(path, what, remedy=remedy), zipfile.ZipFile(path) as archive:
         headers = {info.filename.removesuffix(".npy"): _header(archive, info) for info in archive.infolist()}
+        if len(headers) < len(archive.infolist()):
+            raise ValueError("two of its arrays have one name")
         if check is not None:
             check(headers)
         arrays = {}

@@ -8,6 +8,7 @@ import re
 import shutil
 import tomllib
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -81,11 +82,11 @@ def read_json(path: PathLike) -> Any:
 
     Raises:
         MissingFileError: there is no such file.
-        InputError: the file is not JSON, or nested too deeply.
+        InputError: the file is not JSON, nested too deeply, or names a key twice.
     """
     path = existing(path, "file")
     with decoding(path, "JSON file", remedy="mend it or write it again"):
-        return json.loads(path.read_text(encoding="utf-8-sig"))
+        return json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_unique)
 
 
 def read_toml(path: PathLike) -> dict[str, Any]:
@@ -304,6 +305,15 @@ def _runs(process: int) -> bool:
     except OSError:
         return True  # of someone else
     return True
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Entries of a JSON object, where a key that is written twice would hide the first value."""
+    entries = dict(pairs)
+    if len(entries) < len(pairs):
+        twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"the key {twice[:40]!r} is written twice")
+    return entries
 
 
 def _reason(error: BaseException) -> str:

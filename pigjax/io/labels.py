@@ -95,6 +95,14 @@ def load_labels(path: PathLike, count: int | None = None, *, scene: str | None =
         raise InputError(f"{path}: votes are negative or not finite; {_REMEDY}.")
     if not ((labels.confidence >= 0) & (labels.confidence <= 1 + 1e-3)).all():  # sums of shares are rounded
         raise InputError(f"{path}: confidence is not a share from 0 to 1; {_REMEDY}.")
+    if labels.ids is not None and len(labels.ids):
+        ids = labels.ids
+        if not (int(ids.min()) >= 0 and int(ids.max()) < 2**31 and (ids[1:] > ids[:-1]).all()):
+            raise InputError(f"{path}: ids are not whole numbers from 0 to 2³¹ - 1 in rising order; {_REMEDY}.")
+    known = np.arange(labels.votes.shape[1]) if labels.ids is None else labels.ids
+    strange = np.setdiff1d(labels.object_id, np.append(known, (-1, 0)))
+    if len(strange):
+        raise InputError(f"{path}: object_id holds {strange[0]}, for which votes have no column; {_REMEDY}.")
     return labels._replace(object_id=labels.object_id.astype(np.int32))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -125,7 +126,7 @@ def _finder(
         return read_views(existing(folder, "JSON of masks"), frames, id_field).get
     folder = existing_folder(folder, "folder of masks")
     candidates = {name: [folder / f"{name}{suffix}" for suffix in (".png", ".npy", ".json")] for name in names}
-    files = {name: next((path for path in paths if path.is_file()), None) for name, paths in candidates.items()}
+    files = {name: next((path for path in paths if os.path.isfile(path)), None) for name, paths in candidates.items()}
     listings = [path for path in folder.glob("*.json") if path.name != "pred.json"]
     if len(listings) == 1 and not any(files.values()):
         return read_views(listings[0], frames, id_field).get

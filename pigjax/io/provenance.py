@@ -70,7 +70,7 @@ def file_digest(path: PathLike) -> str:
         InputError: it cannot be read.
     """
     path = Path(path)
-    if not path.exists():
+    if not os.path.exists(path):
         return "missing"
     hasher = hashlib.blake2b(digest_size=8)
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
@@ -124,7 +124,8 @@ def claim(
     folder = output_folder(folder)
     key = digest(sorted(parts.items()))
     file = folder / FILE
-    old = [entry for pattern in results for entry in folder.glob(pattern)]
+    # an empty folder is what a command leaves that was refused before it had results
+    old = [entry for pattern in results for entry in folder.glob(pattern) if not _is_empty_folder(entry)]
     if old:
         found = _recorded(file)
         try:
@@ -145,6 +146,10 @@ def claim(
                 remove(entry)
     write_json(file, {"key": key, "parts": dict(parts)})
     return key
+
+
+def _is_empty_folder(path: Path) -> bool:
+    return path.is_dir() and next(path.iterdir(), None) is None
 
 
 def _recorded(file: Path) -> dict[str, str] | None:

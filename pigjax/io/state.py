@@ -176,7 +176,7 @@ def resumed(path: PathLike, like: Tree, *, parts: Parts, overwrite: bool = False
     Raises:
         StaleError: it was made from other parts.
     """
-    if not Path(path).is_file():
+    if not os.path.isfile(path):
         return None
     try:
         return load_pytree(path, like, parts=parts)

@@ -114,8 +114,9 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
             raise SceneError("input.views is missing: several objects can be told apart by masks only.")
         (only,) = inputs.ids.values()
         count = len(inputs.gaussians)
-        ids = jnp.asarray([0, only], jnp.int32)
-        return Labels(jnp.full(count, only, jnp.int32), jnp.zeros((count, 2), jnp.int32), jnp.ones(count), ids=ids)
+        ids = jnp.asarray(sorted({0, only}), jnp.int32)
+        votes = jnp.zeros((count, len(ids)), jnp.int32)
+        return Labels(jnp.full(count, only, jnp.int32), votes, jnp.ones(count), ids=ids)
     views = inputs.views.subset("train") if "train" in inputs.views.splits else inputs.views
     assert views.masks is not None
     check_ids_occur(inputs.ids, views.masks)

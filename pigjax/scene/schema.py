@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
@@ -318,7 +319,7 @@ def read_file(path: Path, what: str) -> dict[str, Any]:
         MissingFileError: there is no such file.
         SceneError: it is not TOML.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):  # False, too, where no file can have the path
         raise MissingFileError(f"{path}: {what} does not exist; check the path.")
     try:
         return io.read_toml(path)

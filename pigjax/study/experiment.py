@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from scipy.cluster.vq import kmeans2
 
 from pigjax.clamp import ClampParams
@@ -36,6 +36,7 @@ from pigjax.mpm.materials import Material, MaterialTable, Parameters
 from pigjax.mpm.timestep import first_substeps, stable_dt
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, render_config, segment
 from pigjax.scene.schema import Scene
+from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, RenderConfig, Splats, render
 
 _NUMBERS = tuple(field.name for field in fields(Parameters))
@@ -284,7 +285,7 @@ def _only_named(inputs: Inputs, plan: Plan) -> tuple[Inputs, Plan]:
     object_id = np.asarray(plan.labels.object_id)
     kept = np.isin(object_id, [0, *inputs.ids.values()])
     row = jnp.asarray(np.cumsum(kept) - 1)
-    labels = jax.tree.map(lambda column: column[kept] if column.ndim else column, plan.labels)
+    labels = _of_some(plan.labels, kept)
     carried = plan.particles.gaussian
     particles = replace(plan.particles, gaussian=jnp.where(carried >= 0, row[carried], -1).astype(carried.dtype))
     binding = plan.binding
@@ -292,6 +293,12 @@ def _only_named(inputs: Inputs, plan: Plan) -> tuple[Inputs, Plan]:
         binding = replace(binding, gaussian=row[binding.gaussian])
     gaussians = jax.tree.map(lambda column: column[kept], inputs.gaussians)
     return replace(inputs, gaussians=gaussians), replace(plan, particles=particles, binding=binding, labels=labels)
+
+
+def _of_some(labels: Labels, kept: Bool[np.ndarray, "n"]) -> Labels:
+    """Labels of some of the Gaussians; the columns of the votes stay."""
+    own = {name: getattr(labels, name)[kept] for name in ("object_id", "votes", "confidence")}
+    return replace(labels, **own)
 
 
 def _assemble(scene: Scene, inputs: Inputs, plan: Plan) -> Experiment:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import os
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -192,7 +193,7 @@ def _share(outcome: Outcome, rows: tuple[int, ...]) -> Float[Array, "p"]:
 
 
 def _from_file(path: Path, name: str) -> Callable[..., Scores]:
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise MissingFileError(f"{path}: file of objective.function does not exist; check the path.")
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None:
@@ -219,7 +220,8 @@ def _running(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except SyntaxError as error:
-        raise InputError(f"{error.filename or path}, line {error.lineno}: {error.msg}; mend the objective.") from error
+        where = f"{error.filename or path}" + (f", line {error.lineno}" if error.lineno else "")
+        raise InputError(f"{where}: {error.msg}; mend the objective.") from error
     except (Exception, SystemExit) as error:
         frames = traceback.extract_tb(error.__traceback__)
         line = next((frame.lineno for frame in reversed(frames) if Path(frame.filename) == path), None)
@@ -250,12 +252,12 @@ def _check_options(found: Callable[..., Scores], options: dict[str, Any], functi
 def _read_target(folder: Path, target: str) -> Float[Array, "t h w 3"]:
     """Frames of a folder of pictures, of a video, or of an `.npy` file."""
     path = folder / target
-    if path.is_dir():
+    if os.path.isdir(path):
         pictures = [io.read_image(picture) for picture in sorted(path.glob("*.png"))]
         if len({picture.shape for picture in pictures}) != 1:
             raise InputError(f"{path}: objective.options.target needs .png frames, all of one size.")
         return jnp.asarray(np.stack(pictures))
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise MissingFileError(f"{path}: objective.options.target does not exist; check the path.")
     if path.suffix != ".npy":
         return jnp.asarray(io.read_video(path))

@@ -102,6 +102,10 @@ class AimOptions(Section, frozen=True):
     target: Annotated[tuple[float, float, float], Limits(-1e9, 1e9, unit="m", nan=True)]
     frame: Annotated[int, Limits(-100_000, 99_999)] = -1  # after which it is looked at, from 0; -1: the last
 
+    def rules(self) -> Iterable[tuple[str, bool, str]]:
+        """Some axis counts."""
+        yield "target", not np.isnan(self.target).all(), "give a number for one axis or more, or nothing is aimed at"
+
 
 class ShapeOptions(Section, frozen=True):
     """Options of the objective `shape`."""
@@ -173,6 +177,8 @@ class Study(Section, frozen=True):
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """Something varies."""
         yield "parameters", bool(self.parameters), "a study varies one or more"
+        twice = self.only is not None and len(set(self.only)) < len(self.only)
+        yield "only", not twice, "an object is named twice; name each once"
 
     def to_scene(self) -> Scene:
         """The scene with the changes of this study.
@@ -252,8 +258,8 @@ def load_study(path: str | Path, *, method: str | None = None) -> Study:
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error.__cause__
     if study.objective.is_code():
-        code = (path.parent / study.objective.function.rpartition(":")[0]).resolve()
-        if not code.is_relative_to(Path.cwd()):
+        code = path.parent / study.objective.function.rpartition(":")[0]
+        if os.path.isfile(code) and not (code := code.resolve()).is_relative_to(Path.cwd()):
             warnings.warn(
                 f"{path}: objective.function runs the Python code of {code}, outside the working folder; go on only if"
                 " you trust it.",

@@ -34,8 +34,8 @@ class Bounds:
     scale: Literal["linear", "log"] = "linear"  # of the steps
 
     def __post_init__(self):
-        if self.scale not in ("linear", "log"):
-            raise InputError(f"Bounds.scale = {self.scale!r}: choose linear or log.")
+        if not isinstance(self.scale, str) or self.scale not in ("linear", "log"):
+            raise InputError(f"Bounds.scale = {shown(self.scale)}: choose linear or log.")
         for name, end in (("low", self.low), ("high", self.high)):
             if end is not None and not _is_numbers(end):
                 raise InputError(f"Bounds.{name} = {shown(end)}: must be a number, one for each component, or None.")
@@ -121,7 +121,7 @@ class Bounds:
 def _is_numbers(end: Any) -> bool:
     try:
         array = np.asarray(end)
-    except ValueError:  # a list of lists that differ in length
+    except (TypeError, ValueError):  # a list of lists that differ in length, a random key
         return False
     return array.size > 0 and np.issubdtype(array.dtype, np.number)
 
