@@ -379,7 +379,7 @@ def test_labels_and_prompts_that_do_not_fit_are_named(tmp_path):
         evaluate()
     path = tmp_path / "labels.npz"
     path.write_bytes(b"PK\x03\x04")
-    with pytest.raises(InputError, match=r"labels\.npz: not the labels\.npz of 'pigjax segment'"):
+    with pytest.raises(InputError, match=r"labels\.npz: not a readable labels\.npz of 'pigjax segment'"):
         evaluate(labels=path)
     np.savez(path, object_id=np.ones(3, int), votes=np.ones((3, 2)), confidence=np.ones(3))
     with pytest.raises(InputError, match=rf"labels 3 Gaussians, the scene has {len(gaussians)}"):

@@ -91,16 +91,29 @@ def load_arrays(
         return arrays
 
 
-def load_array(path: PathLike, what: str, *, remedy: str = "save it again") -> np.ndarray:
+def load_array(
+    path: PathLike,
+    what: str,
+    *,
+    remedy: str = "save it again",
+    check: Callable[[ArrayHeader], None] = lambda header: None,
+) -> np.ndarray:
     """The array of a `.npy`; no memory is asked for that the file does not fill.
+
+    Args:
+        path: of the file.
+        what: the kind of file, for messages.
+        remedy: what the reader of a message can do.
+        check: told shape and type before the array is read; what it raises comes through.
 
     Raises:
         MissingFileError: there is no such file.
-        InputError: the file is damaged, or holds Python objects.
+        InputError: the file is damaged, holds Python objects, or `check` refuses it.
     """
     path = existing(path, what)
     with decoding(path, what, remedy=remedy), path.open("rb") as file:
         header = _read_header(file)
+        check(header)
         left = path.stat().st_size - file.tell()
         if _bytes_of(header) > left:
             raise ValueError(f"its header tells of {_bytes_of(header)} bytes, and {left} follow")
@@ -172,16 +185,21 @@ def _header(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> ArrayHeader:
 
 
 def _read_header(file: Any) -> ArrayHeader:
-    version = np.lib.format.read_magic(file)
-    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
-    if read is None:
-        raise ValueError(f"version {version} of .npy")
-    shape, _, dtype = read(file)
+    try:
+        version = np.lib.format.read_magic(file)
+        shape, _, dtype = _HEADERS[version](file)
+    except OSError:
+        raise
+    except Exception as error:  # NumPy reads it as Python code, and answers in the words of a tokenizer
+        raise ValueError("the header of an array is damaged") from error
     if dtype.hasobject:
         raise ValueError("it holds Python objects")
     if any(extent < 0 for extent in shape):
         raise ValueError(f"shape {shape}")
     return ArrayHeader(shape, dtype)
+
+
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def _bytes_of(header: ArrayHeader) -> int:
