@@ -1,5 +1,6 @@
 """Damage is told in plain words of the file: none of Python's settings, tokenizers, classes or addresses."""
 
+import hashlib
 import io as memory
 import json
 import re
@@ -35,7 +36,12 @@ def masks(path):
     return io.load_masks(path.parent, [path.stem], (8, 6))
 
 
-BROKEN_HEADERS = ["{'descr': '<i4', 'shape': (6, 8", "{'descr': x, 'fortran_order': False, 'shape': (6, 8), }", "(", "'''"]
+BROKEN_HEADERS = [
+    "{'descr': '<i4', 'shape': (6, 8",
+    "{'descr': x, 'fortran_order': False, 'shape': (6, 8), }",
+    "(",
+    "'''",
+]
 DAMAGE = {
     "digits of JSON": ("a.json", f"[{DIGITS}]".encode(), io.read_json, "a number has more than"),
     "digits of TOML": ("a.toml", f"x = {DIGITS}".encode(), load_scene, "a number has more than"),
@@ -46,7 +52,7 @@ DAMAGE = {
     "end of COLMAP": ("points3D.bin", b"\x01" + bytes(30), io.load_points, "it ends too early"),
     "objects": ("v.npy", with_header("{'descr': '|O', 'fortran_order': False, 'shape': (6, 8), }"), masks, "objects"),
     "size of a mask": (
-        "v.npy", with_header("{'descr': '<i4', 'fortran_order': False, 'shape': (6, 8), }"), masks, "192 bytes",
+        "v.npy", with_header("{'descr': '<i4', 'fortran_order': False, 'shape': (6, 8), }"), masks, "tells of 192 bytes",
     ),
     **{f"mask {text}": ("v.npy", with_header(text), masks, "header of an array is damaged") for text in BROKEN_HEADERS},
     **{f"labels {t}": ("a.npz", archive(t), io.load_labels, "header of an array is damaged") for t in BROKEN_HEADERS},
@@ -66,6 +72,23 @@ def test_damage_is_told_in_words_of_the_file(tmp_path, name, content, read, said
     assert ";" in message
     assert not re.search(OF_PYTHON, message)
     assert len(message) < 300
+
+
+@pytest.mark.parametrize(
+    "header, said",
+    [
+        ("{'descr': '<f4', 'fortran_order': False, 'shape': (10**12,), }", "header of an array is damaged"),
+        ("{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000,), }", "tells of 4000000000000 bytes, and"),
+        ("{'descr': '<f4', 'fortran_order': False, 'shape': (3,), }", r"float32 \(3,\) in place of float32 \(4,\)"),
+        ("{'descr': '|O', 'fortran_order': False, 'shape': (4,), }", "holds Python objects"),
+    ],
+)
+def test_a_checkpoint_whose_checksum_fits_asks_for_no_memory_that_it_does_not_fill(tmp_path, header, said):
+    path, payload = tmp_path / "a.ckpt", with_header(header)
+    known = hashlib.sha256(b"[]" + payload).hexdigest()
+    path.write_bytes(json.dumps({"sha256": known, "parts": {}}).encode() + b"\n" + payload)
+    with pytest.raises(InputError, match=rf"a\.ckpt: not a readable checkpoint \(.*{said}.*\); use the settings"):
+        io.load_pytree(path, np.zeros(4, np.float32))
 
 
 EYE = np.eye(4).tolist()

@@ -179,7 +179,9 @@ def write_toml(path: PathLike, content: Any) -> None:
     try:
         text = tomli_w.dumps(content)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: content has no TOML form ({reason_of(error)}); give plain numbers or text.") from error
+        raise InputError(
+            f"{path}: content has no TOML form ({reason_of(error)}); give plain numbers or text."
+        ) from error
     if _whole_text(text) != text:
         warnings.warn(f"{path}: a path in it is not UTF-8, as TOML asks; rename that folder.", stacklevel=2)
     write_text(path, text)
@@ -322,6 +324,8 @@ def reason_of(error: BaseException) -> str:
     for pattern, meaning in _MEANINGS.items():
         if found := re.search(pattern, said):
             return found.expand(meaning)
+    if said.startswith("Error at leaf") and error.__cause__ is not None:  # equinox, around what a leaf's reader raised
+        return reason_of(error.__cause__)
     named = next((meaning for kind, meaning in _MEANINGS_OF_KINDS.items() if isinstance(error, kind)), None)
     return named or said[:200] or type(error).__name__
 
