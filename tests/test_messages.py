@@ -36,6 +36,7 @@ def masks(path):
     return io.load_masks(path.parent, [path.stem], (8, 6))
 
 
+SOUND = "{'descr': '<i4', 'fortran_order': False, 'shape': (6, 8), }"  # but no array follows
 BROKEN_HEADERS = [
     "{'descr': '<i4', 'shape': (6, 8",
     "{'descr': x, 'fortran_order': False, 'shape': (6, 8), }",
@@ -50,17 +51,15 @@ DAMAGE = {
     "count of COLMAP": ("points3D.txt", b"1 2 3\n", io.load_points, "not enough parts"),
     "word of COLMAP": ("points3D.txt", b"1 x 2 3 4 5 6 7\n", io.load_points, "'x' is no number"),
     "end of COLMAP": ("points3D.bin", b"\x01" + bytes(30), io.load_points, "it ends too early"),
-    "objects": ("v.npy", with_header("{'descr': '|O', 'fortran_order': False, 'shape': (6, 8), }"), masks, "objects"),
-    "size of a mask": (
-        "v.npy", with_header("{'descr': '<i4', 'fortran_order': False, 'shape': (6, 8), }"), masks, "tells of 192 bytes",
-    ),
+    "objects": ("v.npy", with_header(SOUND.replace("<i4", "|O")), masks, "it holds Python objects"),
+    "size of a mask": ("v.npy", with_header(SOUND), masks, "tells of 192 bytes, and 100 follow"),
     **{f"mask {text}": ("v.npy", with_header(text), masks, "header of an array is damaged") for text in BROKEN_HEADERS},
     **{f"labels {t}": ("a.npz", archive(t), io.load_labels, "header of an array is damaged") for t in BROKEN_HEADERS},
     "table": ("a.npz", archive("("), load_table, "header of an array is damaged"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name, content, read, said", DAMAGE.values(), ids=DAMAGE)
+@pytest.mark.parametrize(("name", "content", "read", "said"), DAMAGE.values(), ids=DAMAGE)
 def test_damage_is_told_in_words_of_the_file(tmp_path, name, content, read, said):
     path = tmp_path / name
     path.write_bytes(content)
@@ -75,7 +74,7 @@ def test_damage_is_told_in_words_of_the_file(tmp_path, name, content, read, said
 
 
 @pytest.mark.parametrize(
-    "header, said",
+    ("header", "said"),
     [
         ("{'descr': '<f4', 'fortran_order': False, 'shape': (10**12,), }", "header of an array is damaged"),
         ("{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000,), }", "tells of 4000000000000 bytes, and"),
@@ -96,9 +95,9 @@ CAMERAS = {"fl_x": 10.0, "fl_y": 10.0, "cx": 4.0, "cy": 3.0, "w": 8, "h": 6}
 RUNS = {"size": [6, 8], "counts": [48]}
 
 
-@pytest.mark.parametrize("half", ["\ud800", "\udcff"])
+@pytest.mark.parametrize("code", [0xD800, 0xDCFF])
 @pytest.mark.parametrize(
-    "content, read",
+    ("content", "read"),
     [
         (lambda half: {"1": half}, load_names),
         (lambda half: {half: {"1": RUNS}}, lambda path: io.load_masks(path, ["v"], (8, 6))),
@@ -107,9 +106,9 @@ RUNS = {"size": [6, 8], "counts": [48]}
         (lambda half: CAMERAS | {"frames": [{"file_path": half, "transform_matrix": EYE}]}, io.load_cameras),
     ],
 )  # fmt: skip
-def test_names_with_half_a_character_are_refused(tmp_path, content, read, half):
+def test_names_with_half_a_character_are_refused(tmp_path, content, read, code):
     path = tmp_path / "a.json"
-    path.write_text(json.dumps(content(half)))
+    path.write_text(json.dumps(content(chr(code))))
     with pytest.raises(InputError, match=r"a\.json: .*a text holds \\ud(800|cff), half of a character") as caught:
         read(path)
     str(caught.value).encode()

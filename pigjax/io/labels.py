@@ -103,9 +103,8 @@ def _check_headers(path: PathLike, headers: Mapping[str, ArrayHeader], count: in
     for name, (kind, axes, wanted) in kinds.items():
         found = headers[name]
         if found.dtype.kind not in kind or len(found.shape) != axes:
-            raise InputError(
-                f"{path}: not a readable {_WHAT} ({name} is {found.dtype} {list(found.shape)}, not {wanted}); {_REMEDY}."
-            )
+            told = f"{name} is {found.dtype} {list(found.shape)}, not {wanted}"
+            raise InputError(f"{path}: not a readable {_WHAT} ({told}); {_REMEDY}.")
     rows = {name: headers[name].shape[0] for name in kinds if name != "ids"}
     if "ids" in headers and headers["ids"].shape[0] != headers["votes"].shape[1]:
         raise InputError(
