@@ -220,8 +220,8 @@ def evaluate(
             bar.update(tasks[stage], completed=done)
 
         report = evaluate_files(
-            cloud, read, out, labels=labels, prompts=prompts, reference=reference,
-            fill=fill, origin=origin, progress=tell, overwrite=overwrite, **_settings(tau_t, tau_d, weighting, purity, min_seen),
+            cloud, read, out, labels=labels, prompts=prompts, reference=reference, fill=fill,
+            origin=origin, progress=tell, overwrite=overwrite, **_settings(tau_t, tau_d, weighting, purity, min_seen),
         )  # fmt: skip
     scores = report.evaluation.scores
     table = Table("prompt", "object", "views", *(f"{level} mIoU / mBIoU %" for level in scores))
