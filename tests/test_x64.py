@@ -13,7 +13,7 @@ from pigjax.boxes import Fit
 from pigjax.camera import orbit, unproject
 from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.cli import app
-from pigjax.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
+from pigjax.colliders import Plane, Sphere
 from pigjax.contact import BodyContact
 from pigjax.editing import extract_object, hole_mask
 from pigjax.materials import Material, material_table
@@ -131,41 +131,35 @@ def test_the_clamp_has_the_precision_of_the_gaussians(x64, mode):
     assert precisions(eigen_clamp(gaussians, stretch, ClampParams(), mode=mode)) == {np.dtype(np.float32)}
 
 
-IMPLICIT = {"integrator": "implicit", "kernel": "cubic"}
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("choices", [{"kernel": "cubic"}, IMPLICIT, {"differentiation": "forward"}])
-def test_rollouts_and_their_derivatives_have_the_precision_of_the_particles(x64, dtype, choices):
-    """Traced, not computed, with a collider of each kind in float64."""
-    numbers = {"friction": 0.3, "softness": 0.05, "velocity": [0.0, 0.0, 0.1], "angular_velocity": [0.0, 0.1, 0.0]}
-    ends = {"start": [0.0, 0.0, 0.0], "end": [1.0, 0.0, 0.0], "radius": 0.1}
-    solids = (
-        Plane(point=np.zeros(3), normal=[0, 0, 1], **numbers), Sphere(centre=np.zeros(3), radius=0.1, **numbers),
-        Box(lower=-np.ones(3), upper=np.zeros(3), rotation=[1.0, 0.1, 0, 0]), Capsule(**ends, mode="sticky"),
-        Cylinder(**ends, mode="slip"), SampledDistance(samples=np.ones((4, 4, 4)), origin=np.zeros(3), dx=0.1),
-    )  # fmt: skip
-    laws = "neo_hookean", "fixed_corotated"
-    table = material_table([Material(law, density=1000.0, young=1e4, poisson=0.3) for law in laws])
-    x = np.random.default_rng(0).uniform(0.2, 0.4, (40, 3)).astype(dtype)
-    particles = make_particles(x, volume=1e-6, table=table, material=np.repeat([0, 1], 20), body=np.repeat([0, 1], 20))
-    grid, config = fit_grid(x, 0.1, margin=0.5), SimConfig(substeps=1, devices=1, box=(12, 12, 12), **choices)
-    contact = None if choices == IMPLICIT else BodyContact(bodies=2, friction=0.3)
+def traced(config, contact=None, derived=False):
+    """Types of a rollout and of its derivatives: particles in float32, all else in float64. Nothing is computed."""
+    table = material_table([Material("neo_hookean", density=1000.0, young=1e4, poisson=0.3)])
+    x = np.random.default_rng(0).uniform(0.2, 0.4, (40, 3)).astype(np.float32)
+    particles = make_particles(x, volume=1e-6, table=table, body=np.repeat([0, 1], 20))
+    grid, spin = fit_grid(x, 0.1, margin=0.5), {"softness": 0.05, "angular_velocity": [0.0, 0.1, 0.0]}
 
     def end(v, friction, density):
         moved = eqx.tree_at(lambda p: p.v, particles, v)
-        around = eqx.tree_at(lambda s: s[0].friction, solids, friction)
         other = eqx.tree_at(lambda t: t.density, table, density)
-        gravity = np.array([0.0, 0.0, -9.81])
-        steps = {"frames": 1, "frame_dt": 1e-3, "gravity": gravity, "colliders": around, "contact": contact}
-        return rollout(moved, grid, other, config, **steps)
+        floor = Plane(point=np.zeros(3), normal=[0, 0, 1], friction=friction, **(spin if derived else {}))
+        steps = {"frame_dt": 1e-3, "gravity": np.array([0.0, 0.0, -9.81]), "colliders": (floor,), "contact": contact}
+        found = rollout(moved, grid, other, config, frames=1, **steps)
+        return found[0].x.sum(), found
 
-    given = particles.v, jnp.asarray(0.3), table.density
-    assert precisions(jax.eval_shape(end, *given)) == {np.dtype(dtype)}
-    derive = jax.jacfwd if config.differentiation == "forward" else jax.grad
-    slopes = jax.eval_shape(derive(lambda *given: end(*given)[0].x.sum(), argnums=(0, 1, 2)), *given)
-    if derive is jax.grad:
-        assert [slope.dtype for slope in slopes] == [given.dtype for given in given]
+    function = jax.grad(end, argnums=(0, 1, 2), has_aux=True) if derived else end
+    return jax.eval_shape(function, particles.v, jnp.asarray(0.3), table.density)
+
+
+def test_derivatives_of_a_rollout_have_the_precision_of_what_they_are_by(x64):
+    config = SimConfig(substeps=1, devices=1, box=(12, 12, 12))
+    slopes, found = traced(config, contact=BodyContact(bodies=2, friction=0.3), derived=True)
+    assert precisions(found) == {np.dtype(np.float32)}
+    assert [slope.dtype for slope in slopes] == [np.float32, np.float64, np.float64]
+
+
+def test_implicit_steps_have_the_precision_of_the_particles(x64):
+    config = SimConfig(substeps=1, devices=1, box=(12, 12, 12), integrator="implicit", kernel="cubic")
+    assert precisions(traced(config)[1]) == {np.dtype(np.float32)}
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
