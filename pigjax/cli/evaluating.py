@@ -39,6 +39,7 @@ def evaluate_files(
     prompts: Path | None = None,
     reference: str | None = None,
     fill: bool = True,
+    origin: tuple[float, float, float] | None = None,
     progress: Callable[[str, int, int], None] = lambda stage, done, of: None,
     overwrite: bool = False,
     **settings: Any,
@@ -55,6 +56,8 @@ def evaluate_files(
         reference: name of that view, which also overrules the data set's names; if not given, the view with most
             prompts.
         fill: give Gaussians that no view saw the id of their neighbours.
+        origin: what was subtracted from the scene's positions [m]. With one, labels are not compared with the Gaussians
+            of their file, whose positions these no longer are. None: nothing was.
         progress: called with the stage, steps done and of all.
         overwrite: replace scores of something else in `out`, instead of refusing them.
         settings: of `lift_masks`.
@@ -78,7 +81,8 @@ def evaluate_files(
     if labels is None:
         lifted = _lift(gaussians, dataset, fill=fill, **settings)
     else:
-        stored = io.load_labels(labels, len(gaussians), scene=io.digest_of_scene(gaussians))
+        scene = io.digest_of_scene(gaussians) if origin is None else None
+        stored = io.load_labels(labels, len(gaussians), scene=scene)
         lifted = Labels(
             jnp.asarray(stored.object_id),
             jnp.asarray(stored.votes),

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Integer, Num
 
-from pigjax.core.errors import InputError, MissingFileError
+from pigjax.core.errors import InputError
 from pigjax.io.archives import ArrayHeader, load_arrays, save_arrays
 from pigjax.io.files import PathLike
 from pigjax.io.provenance import digest
@@ -77,14 +77,7 @@ def load_labels(path: PathLike, count: int | None = None, *, scene: str | None =
     def check(headers: Mapping[str, ArrayHeader]) -> None:
         _check_headers(path, headers, count)
 
-    try:
-        arrays = load_arrays(path, _WHAT, remedy=_REMEDY, check=check)
-    except MissingFileError:
-        raise
-    except InputError as error:
-        if error.__cause__ is None:
-            raise
-        raise InputError(f"{path}: not the {_WHAT} ({error.__cause__}); {_REMEDY}.") from error
+    arrays = load_arrays(path, _WHAT, remedy=_REMEDY, check=check)
     labels = StoredLabels(arrays["object_id"], arrays["votes"], arrays["confidence"], arrays.get("ids"))
     if scene is not None and "scene" in arrays and str(arrays["scene"]) != scene:
         raise InputError(f"{path}: labels the Gaussians of another file, as many as the scene has; segment it again.")
@@ -114,13 +107,12 @@ def _check_headers(path: PathLike, headers: Mapping[str, ArrayHeader], count: in
         kinds["ids"] = ("iu", 1, "whole numbers [m]")
     missing = [name for name in kinds if name not in headers]
     if missing:
-        raise InputError(f"{path}: not the {_WHAT} (it has no {missing[0]}); {_REMEDY}.")
+        raise InputError(f"{path}: not a readable {_WHAT} (it has no {missing[0]}); {_REMEDY}.")
     for name, (kind, axes, wanted) in kinds.items():
         found = headers[name]
         if found.dtype.kind not in kind or len(found.shape) != axes:
-            raise InputError(
-                f"{path}: not the {_WHAT} ({name} is {found.dtype} {list(found.shape)}, not {wanted}); {_REMEDY}."
-            )
+            told = f"{name} is {found.dtype} {list(found.shape)}, not {wanted}"
+            raise InputError(f"{path}: not a readable {_WHAT} ({told}); {_REMEDY}.")
     rows = {name: headers[name].shape[0] for name in kinds if name != "ids"}
     if "ids" in headers and headers["ids"].shape[0] != headers["votes"].shape[1]:
         raise InputError(

@@ -15,6 +15,7 @@ from scipy import ndimage
 
 from pigjax.core.arguments import checked
 from pigjax.core.errors import InputError, MissingFileError
+from pigjax.io.archives import ArrayHeader, load_array
 from pigjax.io.files import PathLike, decoding, existing, existing_folder, read_json, writing
 from pigjax.io.images import open_image
 from pigjax.io.mask_json import ID_LIMIT, Segments, frame_order, paint, read_view, read_views
@@ -165,12 +166,12 @@ def _read_ids(found: Path | Segments, size: tuple[int, int]) -> tuple[Path | str
 
 
 def _read_array(path: Path, check: Callable[[Path, int, int], None]) -> np.ndarray:
-    with decoding(path, ".npy array", remedy="save the mask again"):
-        stored = np.load(path, mmap_mode="r", allow_pickle=False)  # mapped: a shape beyond the file asks for no memory
-        if stored.ndim == 2:
-            check(path, *stored.shape)
-            return np.array(stored)
-    raise InputError(f"{path}: mask is {stored.dtype} {stored.shape}; save whole-number ids [h, w].")
+    def check_header(header: ArrayHeader) -> None:
+        if len(header.shape) != 2:
+            raise InputError(f"{path}: mask is {header.dtype} {header.shape}; save whole-number ids [h, w].")
+        check(path, *header.shape)
+
+    return load_array(path, ".npy array", remedy="save the mask again", check=check_header)
 
 
 def _read_picture(path: Path, check: Callable[[Path, int, int], None]) -> np.ndarray:

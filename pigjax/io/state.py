@@ -12,6 +12,7 @@ import json
 import os
 import warnings
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Shaped
 
 from pigjax.core.errors import InputError, StaleError
-from pigjax.io.archives import load_arrays, save_arrays
+from pigjax.io.archives import load_arrays, read_header, save_arrays
 from pigjax.io.files import PathLike, decoding, existing, writing
 from pigjax.io.provenance import Parts, check_same
 
@@ -152,10 +153,21 @@ def load_pytree(path: PathLike, like: Tree, *, parts: Parts | None = None) -> Tr
         check_same(path, found, parts)
     with decoding(path, "checkpoint", remedy="use the settings it was written with, or delete it"):
         file = io.BytesIO(payload)
-        tree = eqx.tree_deserialise_leaves(file, like)
+        tree = eqx.tree_deserialise_leaves(file, like, filter_spec=partial(_leaf, size=len(payload)))
         if file.read(1):
             raise ValueError("it holds more leaves")
         return tree
+
+
+def _leaf(file: io.BytesIO, like: Any, *, size: int) -> Any:
+    """A leaf as equinox reads it, once its header is known to be that of `like`, so that it asks for no more memory."""
+    if eqx.is_array_like(like):
+        at = file.tell()
+        header, wanted = read_header(file, size), np.asarray(like)
+        if header.shape != wanted.shape or header.dtype != wanted.dtype:
+            raise ValueError(f"it holds {header.dtype} {header.shape} in place of {wanted.dtype} {wanted.shape}")
+        file.seek(at)
+    return eqx.default_deserialise_filter_spec(file, like)
 
 
 def _checksum(parts: Parts, payload: bytes) -> str:
