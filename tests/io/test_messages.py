@@ -8,12 +8,12 @@ import zipfile
 
 import numpy as np
 import pytest
-from pigjax.errors import InputError
 
 from pigjax import io
+from pigjax.core.errors import InputError
 from pigjax.io.datasets import load_names
 from pigjax.scene import load_scene
-from pigjax.tune import load_table
+from pigjax.study.optimize import load_table
 
 DIGITS = "9" * 5000
 OF_PYTHON = r"set_int_max|<ast|tokenize|\(\('|codec|unpack_from|recursion|unhashable|pickle|literal|NUMPY|object at"
