@@ -22,8 +22,8 @@ from _timing import machine, measure, use_host_devices
 from jax import lax
 
 from pigjax import Gaussians, RenderConfig, look_at, render, stack_cameras
-from pigjax.splatting.binning import blend_config, front_to_back, list_pass
-from pigjax.splatting.compositor import blend
+from pigjax.splatting.binning import bin_splats, blend_config, list_pass
+from pigjax.splatting.compositor import composite
 from pigjax.splatting.projection import project_splats
 from pigjax.splatting.sh import colours
 from pigjax.splatting.sharding import replicate
@@ -116,13 +116,17 @@ def stages(text):
     times = {"pose": seconds}
     _, times["project"], projected = measure(lambda s, c: project_splats(s, c, config), splats, camera)
     _, times["colour"], rgb = measure(colours, splats, camera)
-    _, times["order"], boxes = measure(lambda p: front_to_back(p, blending), projected)
+    _, times["order"], boxes = measure(lambda p: bin_splats(p, blending), projected)
     shapes, tiles = projected.shapes[boxes.order], jnp.ones(blending.tiles, bool)
     _, times["first list"], _ = measure(
         lambda s, b, t: list_pass(s, b, 0, t, blending, blending.slots), shapes, boxes, tiles
     )
-    _, times["order+lists+blend"], _ = measure(lambda p, f: blend(p, f, blending)[:2], projected, rgb)
-    slope = jax.grad(lambda p, f: jnp.sum(blend(p, f, blending).features ** 2), argnums=1)
+
+    def drawn(projected, features):
+        return composite(projected, features, bin_splats(projected, blending), blending)
+
+    _, times["order+lists+blend"], _ = measure(lambda p, f: drawn(p, f)[:2], projected, rgb)
+    slope = jax.grad(lambda p, f: jnp.sum(drawn(p, f).features ** 2), argnums=1)
     _, times["the same and backward"], _ = measure(slope, projected, rgb)
     print(f"    {text}, one device, ms: " + ", ".join(f"{name} {t * 1e3:.1f}" for name, t in times.items()), flush=True)
 

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from dense import dense_render
 from facing import ONES, facing_camera, lift, opaque
+from splats import dense, gaussians_of
 
 from pigjax.core.camera import look_at, stack_cameras
 from pigjax.core.errors import InputError
@@ -41,11 +41,6 @@ def make_scene(count=80, seed=0, views=5):
     return scene, stack_cameras(cameras), np.kron(blocks, np.ones((4, 4), int)).astype(np.int32)
 
 
-def gaussians_of(scene):
-    logit = np.log(scene["opacities"] / (1 - scene["opacities"]))
-    return Gaussians(scene["means"], np.log(scene["scales"]), scene["quats"], logit, scene["sh"])
-
-
 def brute_force(scene, cameras, masks, *, tau_T=0.5, tau_d=0.03):
     """Votes and alpha·T sums by the definition, Gaussian by Gaussian, and how near each test is to its threshold."""
     count = len(scene["means"])
@@ -54,10 +49,7 @@ def brute_force(scene, cameras, masks, *, tau_T=0.5, tau_d=0.03):
         pose, focal, centre = (
             np.asarray(v[view], np.float64) for v in (cameras.world_to_cam, cameras.focal, cameras.centre)
         )
-        _, _, _, surface, weights = dense_render(
-            **scene, view=pose, focal=focal, centre=centre, width=WIDTH, height=HEIGHT,
-            config=CONFIG, tau=tau_T, weights=np.eye(count),
-        )  # fmt: skip
+        *_, surface, weights = dense(scene, cameras[view], CONFIG, tau=tau_T, weights=np.eye(count))
         for id_ in range(NUM_IDS):
             credits[:, id_] += weights[mask == id_].sum(0)
         for i, mean in enumerate(scene["means"]):

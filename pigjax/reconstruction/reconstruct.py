@@ -34,7 +34,7 @@ from pigjax.reconstruction.train import (
     twist_of,
 )
 from pigjax.splat import Gaussians, render
-from pigjax.splatting.binning import bands_of
+from pigjax.splatting.binning import shards_of
 from pigjax.splatting.sharding import replicate
 
 
@@ -109,7 +109,7 @@ def reconstruct(
     extent = scene_extent(points[0], name="points").spread
     pose_rate = optax.exponential_decay(config.pose_rate, config.steps, 0.1)
     optimizers = optimizer_of(config, extent), optax.adam(pose_rate)
-    bands = bands_of(train.cameras, config.render)
+    shards = shards_of(train.cameras, config.render)
 
     def start(count: int) -> FitState:
         gaussians = start_gaussians(*points, count, config.sh_degree, seed=config.seed)
@@ -125,7 +125,7 @@ def reconstruct(
     if photos.mattes is not None and not photos.mattes.any():
         raise InputError(f"{_asked(config)}: no mask of the training views has any pixel of it.")
     scored = None if held_out is None else _scored(held_out, config)
-    state, photos, cameras = replicate((state, photos, train.cameras), bands)
+    state, photos, cameras = replicate((state, photos, train.cameras), shards)
     result = Reconstruction(state.gaussians, {}, {}, train.cameras, train.names)
     begun = time.perf_counter()
     while (step := int(state.step)) < config.steps:
@@ -133,7 +133,7 @@ def reconstruct(
             state = grow(state, count, config)
         stop = min(config.steps, _next_stop(step, config))
         state, loss = train_steps(state, cameras, photos, config, optimizers, extent, jnp.asarray(stop - step))
-        state = replicate(state, bands)
+        state = replicate(state, shards)
         if config.relocate_every and stop % config.relocate_every == 0 and stop <= config.relocate_until * config.steps:
             state = relocate_dead(state, config)
         psnrs: dict[str, float] = {}
