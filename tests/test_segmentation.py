@@ -15,7 +15,7 @@ from splats import dense, gaussians_of
 from pigjax.core.camera import look_at, stack_cameras
 from pigjax.core.errors import InputError
 from pigjax.io import load_views
-from pigjax.objects.overlay import id_colours, id_image, legend_sheet, overlay
+from pigjax.objects.overlay import id_colours, legend_sheet, overlay
 from pigjax.segmentation import Labels, fill_unseen, lift_masks, object_mask
 from pigjax.splat import Gaussians, RenderConfig, render
 
@@ -358,11 +358,6 @@ def test_overlay_tints_objects_only_and_ids_have_their_own_colours():
     np.testing.assert_array_equal(outlined[2, 2], plain[2, 2])
     with pytest.raises(InputError, match="ids have size"):
         overlay(image, ids[:3])
-
-
-def test_id_image_is_the_largest_share_where_anything_is_seen():
-    weights = jnp.array([[[0.0, 0.6, 0.3], [0.0, 0.2, 0.2], [0.0, 0.1, 0.8]]])
-    np.testing.assert_array_equal(id_image(weights), [[1, 0, 2]])
 
 
 def test_legend_sheet_has_a_row_per_name_in_its_colour():

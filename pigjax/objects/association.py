@@ -16,7 +16,7 @@ from pigjax.core.arguments import checked
 from pigjax.core.arrays import Scalar
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
-from pigjax.segmentation import check_masks, front_of
+from pigjax.segmentation import check_masks, on_surface
 from pigjax.splat import Gaussians, RenderConfig, Splats
 from pigjax.splatting.types import as_splats
 
@@ -127,7 +127,7 @@ def compact_ids(
 @eqx.filter_jit
 def _mask_of_each(splats: Splats, camera: Camera, mask, tau_T, tau_d, config: RenderConfig):
     """The mask that each Gaussian on the surface lies in, -1 for those that are not on it."""
-    pixel, front, _ = front_of(splats, camera, tau_T, tau_d, config)
+    pixel, front, _ = on_surface(splats, camera, tau_T, tau_d, config)
     return jnp.where(front, mask.ravel()[pixel], -1)
 
 

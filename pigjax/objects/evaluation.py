@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
 from pigjax.core.metrics import MaskScores, mean_iou, score_masks
-from pigjax.segmentation import Labels, object_mask
-from pigjax.splat import Gaussians, RenderConfig, Splats, render
+from pigjax.segmentation import Labels, object_mask, pixel_ids
+from pigjax.splat import Gaussians, RenderConfig, Splats
 from pigjax.splatting.types import as_splats
 
 LEVELS = ("isolated", "visible", "pixels")
-_IDS_TOGETHER = 32  # ids drawn in one pass, which bounds the memory
 
 
 class Evaluation(NamedTuple):
@@ -83,37 +81,6 @@ def evaluate_labels(
     return Evaluation(scores, found, masks)
 
 
-def pixel_ids(
-    gaussians: Gaussians | Splats,
-    labels: Labels,
-    camera: Camera,
-    *,
-    keep: Sequence[int] = (),
-    config: RenderConfig = RenderConfig(),
-) -> tuple[Int[np.ndarray, "h w"], dict[int, Float[np.ndarray, "h w"]]]:
-    """The id with the largest share of each pixel, and the shares of the ids in `keep`, host.
-
-    The share of the background, id 0, is that of its Gaussians, of those never seen, and of what shines through. Ids
-    are drawn 32 at a time, so that memory does not grow with their number; equal shares go to the lowest id.
-    """
-    splats = as_splats(gaussians)
-    object_id = jnp.maximum(jnp.asarray(labels.object_id), 0)
-    present = np.unique(np.append(0, np.asarray(object_id)))
-    together = min(len(present), _IDS_TOGETHER)
-    groups = np.full((-(-len(present) // together), together), -1)
-    groups.ravel()[: len(present)] = present
-    best = jnp.full((camera.height, camera.width), -1.0)
-    winner = jnp.zeros((camera.height, camera.width), int)
-    shares: dict[int, np.ndarray] = {}
-    for group in groups:
-        weights, alpha = _shares(splats, object_id, jnp.asarray(group), camera, config)
-        weights = weights.at[..., 0].add(jnp.where(group[0] == 0, 1 - alpha, 0.0))
-        shares |= {int(number): np.asarray(weights[..., i]) for i, number in enumerate(group) if number in keep}
-        largest, here = jnp.max(weights, -1), jnp.asarray(group)[jnp.argmax(weights, -1)]
-        winner, best = jnp.where(largest > best, here, winner), jnp.maximum(largest, best)
-    return np.asarray(winner), shares
-
-
 def reference_view(truths: Mapping[tuple[str, str], Any]) -> str:
     """The view that shows most prompts, of equal ones the first."""
     counts: dict[str, int] = {}
@@ -138,11 +105,3 @@ def ground_prompts(
         best = max(overlaps, key=lambda number: overlaps[number], default=None)
         objects[prompt] = best if best is not None and overlaps[best] > 0 else None
     return objects
-
-
-@eqx.filter_jit
-def _shares(splats: Splats, object_id, group, camera: Camera, config: RenderConfig):
-    """Share [h w m] of each id of the group, and the coverage [h w] of all splats."""
-    membership = (object_id[:, None] == group).astype(splats.opacities.dtype)
-    frame = render(splats, camera, config, outputs=("alpha", "object_weights"), object_weights=membership)
-    return frame.object_weights, frame.alpha

@@ -6,9 +6,8 @@ import colorsys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Integer, Num, UInt8
+from jaxtyping import Array, Bool, Integer, Num, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from pigjax.core.errors import InputError
@@ -36,21 +35,6 @@ def _colour(number: int) -> tuple[int, int, int]:
     k = number - 1
     red, green, blue = colorsys.hsv_to_rgb(k * _GOLDEN % 1, (0.85, 0.5)[k // 8 % 2], (1.0, 0.7)[k // 16 % 2])
     return round(255 * red), round(255 * green), round(255 * blue)
-
-
-def id_image(
-    object_weights: Float[Array, "*b h w m"], threshold: float = 0.5, *, ids: Int[Array | np.ndarray, "m"] | None = None
-) -> Int[Array, "*b h w"]:
-    """The id with the largest share of each pixel; 0 where all objects together have at most `threshold`.
-
-    Args:
-        object_weights: share of each pixel.
-        threshold: of the sum of shares.
-        ids: the id of each channel; if not given, channel k is id k.
-    """
-    winner = jnp.argmax(object_weights, -1).astype(jnp.int32)
-    winner = winner if ids is None else jnp.asarray(ids, jnp.int32)[winner]
-    return jnp.where(jnp.sum(object_weights, -1) > threshold, winner, 0)
 
 
 def overlay(

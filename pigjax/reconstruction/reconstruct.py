@@ -102,8 +102,7 @@ def reconstruct(
     """
     # the capacity of a picture would drop splats without a word
     config = replace(config, render=replace(config.render, capacity=None, differentiation="reverse"))
-    train = views.subset("train") if "train" in views.splits else views
-    held_out = views.subset("test") if "test" in views.splits else None
+    train, held_out = views.training, views.held_out
     if points is None:
         points = random_points(train.cameras, min(config.splats, 5000), seed=config.seed)
     extent = scene_extent(points[0], name="points").spread

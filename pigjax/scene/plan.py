@@ -116,7 +116,7 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
         count = len(inputs.gaussians)
         ids = jnp.asarray([0, only], jnp.int32)
         return Labels(jnp.full(count, only, jnp.int32), jnp.zeros((count, 2), jnp.int32), jnp.ones(count), ids=ids)
-    views = inputs.views.subset("train") if "train" in inputs.views.splits else inputs.views
+    views = inputs.views.training
     assert views.masks is not None
     check_ids_occur(inputs.ids, views.masks)
     labels = lift(

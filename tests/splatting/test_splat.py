@@ -609,7 +609,7 @@ def test_a_chunks_running_products_and_sums_are_the_same_as_matrix_products(x64)
     rng = np.random.default_rng(4)
     alpha = rng.uniform(0, 0.99, (64, 9)) * rng.integers(0, 2, (64, 9))
     alpha[:, 0], alpha[:, 1] = 0.0, 0.99
-    through, gain = rng.uniform(0.2, 1, 9), rng.normal(size=(64, 9))
+    alpha, through, gain = (jnp.asarray(v) for v in (alpha, rng.uniform(0.2, 1, 9), rng.normal(size=(64, 9))))
     _, camera = make_scene(count=1)
     usual = blend_config(camera, RenderConfig(), 1, surface=False)
     by_scan, by_products = (replace(usual, by_products=products) for products in (False, True))
