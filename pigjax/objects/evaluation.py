@@ -1,4 +1,4 @@
-"""How well the objects of a scene agree with masks of its views: prompts to ids, ids to masks, masks to scores."""
+"""Evaluation of objects against masks of views: prompts to ids, ids to masks, masks to scores."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LEVELS = ("isolated", "visible", "pixels")
 
 
 class Evaluation(NamedTuple):
-    """Scores of a scene on each level, with what they were computed from."""
+    """Scores of a scene on each level, and the ids and masks that they were computed from."""
 
     scores: dict[str, MaskScores]  # by level
     objects: dict[str, int | None]  # id of each prompt, None where no object was found
@@ -39,16 +39,16 @@ def evaluate_labels(
     config: RenderConfig = RenderConfig(),
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Evaluation:
-    """mIoU and mBIoU of labelled Gaussians by the protocol of Gaussian Grouping, host.
+    """mIoU and mBIoU of labelled Gaussians by the protocol of Gaussian Grouping (Ye et al. 2024). Host.
 
     Three levels: "isolated" and "visible" are `object_mask` > 0.5 in these modes, which judge the Gaussians of the
-    object (3D); "pixels" gives each pixel the id with the largest share of it, background among them (2D).
+    object (3D); "pixels" gives each pixel the id with the largest share, the background included (2D).
 
     Args:
         gaussians: the scene.
         labels: object of each Gaussian; those never seen (-1) are background.
         cameras: single cameras by view.
-        truths: masks by (view, prompt); a prediction of another size is resized to the nearest pixel.
+        truths: masks by (view, prompt); a prediction of another size is resized by nearest neighbour.
         objects: id of each prompt. None, or an id that no Gaussian has: the prompt is missing and scores 0.
         config: the renderer's settings.
         progress: called with the number of views done and of all.
@@ -82,7 +82,11 @@ def evaluate_labels(
 
 
 def reference_view(truths: Mapping[tuple[str, str], Any]) -> str:
-    """The view that shows most prompts, of equal ones the first."""
+    """The view that shows most prompts; of equal ones the first.
+
+    Args:
+        truths: masks by (view, prompt).
+    """
     counts: dict[str, int] = {}
     for view, _ in truths:
         counts[view] = counts.get(view, 0) + 1
@@ -92,7 +96,7 @@ def reference_view(truths: Mapping[tuple[str, str], Any]) -> str:
 def ground_prompts(
     ids: Int[Array | np.ndarray, "h w"], truths: Mapping[str, Bool[np.ndarray, "_ _"]]
 ) -> dict[str, int | None]:
-    """The object that overlaps each prompt's mask best in one view, by IoU; None where none does. Host.
+    """The object with the largest IoU with each prompt's mask in one view; None where none overlaps it. Host.
 
     Args:
         ids: object of each pixel, 0 = background.

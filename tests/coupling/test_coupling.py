@@ -270,7 +270,7 @@ def test_bad_input_is_named(seeded):
 
 def test_only_what_moves_is_written(seeded):
     """Colours and opacities are those of the scene, untouched, and so is every row of a Gaussian at rest."""
-    gaussians, labels, particles, _ = seeded
+    gaussians, _, particles, _ = seeded
     gaussians = eqx.tree_at(lambda g: g.sh, gaussians, jnp.zeros((len(gaussians), 4, 3)).at[:, 2].set(0.3))
     moved = eqx.tree_at(lambda p: (p.x, p.F_visual), particles, (particles.x + 0.1, 1.1 * particles.F_visual))
     posed, rest = deform(gaussians, moved, ClampParams()), as_splats(gaussians)
