@@ -12,10 +12,10 @@ import numpy as np
 from pigjax import io
 from pigjax.core.errors import InputError
 from pigjax.core.metrics import mean_iou
-from pigjax.objects.evaluation import Evaluation, evaluate_labels, ground_prompts, pixel_ids, reference_view
+from pigjax.objects.evaluation import Evaluation, evaluate_labels, ground_prompts, reference_view
 from pigjax.objects.lifting import lift
 from pigjax.objects.overlay import comparison_sheet
-from pigjax.segmentation import Labels, fill_unseen
+from pigjax.segmentation import Labels, fill_unseen, pixel_ids
 from pigjax.splat import Gaussians
 
 _MOST_ROWS = 24

@@ -19,10 +19,10 @@ from pigjax.core.gaussians import SH_CONSTANT
 from pigjax.io.files import existing
 from pigjax.objects.editing import extract_object, hole_mask, remove_object
 from pigjax.objects.lifting import lift
-from pigjax.objects.overlay import colours_of, id_image, legend_sheet, overlay
+from pigjax.objects.overlay import colours_of, legend_sheet, overlay
 from pigjax.reconstruction.prune import contributions
 from pigjax.scene.schema import load_scene
-from pigjax.segmentation import Labels
+from pigjax.segmentation import Labels, pixel_ids
 from pigjax.splat import Gaussians, render
 from pigjax.splatting.sh import sh_degree_of
 from pigjax.splatting.types import extent_of
@@ -85,7 +85,7 @@ def segment_files(
     results = ("labels.npz", "coloured.ply", "objects.png", "objects", "removed")
     io.claim(out, parts, results=results, overwrite=overwrite)
     io.output_folder(out / "objects")
-    train = views.subset("train") if "train" in views.splits else views
+    train = views.training
     assert train.masks is not None
     labels = lift(gaussians, train.cameras, train.masks, fill=fill, **settings)
     object_id = np.asarray(labels.object_id)
@@ -99,7 +99,7 @@ def segment_files(
     colours = colours_of(object_id) / 255
     flat = jnp.asarray((colours - 0.5) / SH_CONSTANT, jnp.float32)[:, None]
     io.save_ply(out / "coloured.ply", eqx.tree_at(lambda g: g.sh, gaussians, flat), origin=origin)
-    io.write_image(out / "objects.png", _sheet(gaussians, views, object_id, names))
+    io.write_image(out / "objects.png", _sheet(gaussians, views, labels, names))
     for number in doomed:
         _remove(gaussians, labels, number, views, out / "removed", _stem(number, names), origin)
     return counts
@@ -137,20 +137,15 @@ def _remove(
     io.write_image(folder / f"{stem}.png", io.contact_sheet(pictures, columns=2))
 
 
-def _sheet(gaussians: Gaussians, views: io.Views, object_id: np.ndarray, names: dict[int, str]) -> np.ndarray:
+def _sheet(gaussians: Gaussians, views: io.Views, labels: Labels, names: dict[int, str]) -> np.ndarray:
     """A few photos with the lifted objects laid over them, and the legend below."""
     chosen = np.unique(np.linspace(0, len(views) - 1, _SHEET_VIEWS).astype(int))
-    ids = np.unique(np.maximum(object_id, 0))
-    membership = jnp.asarray(object_id[:, None] == ids, gaussians.means.dtype)
     tinted, shown = [], []
     for view in chosen:
-        camera = views.cameras[int(view)]
-        frame = render(gaussians, camera, outputs=("object_weights",), object_weights=membership)
-        assert frame.object_weights is not None
-        shown.append(np.asarray(id_image(frame.object_weights, ids=ids)))
+        shown.append(pixel_ids(gaussians, labels, views.cameras[int(view)])[0])
         tinted.append(overlay(views.images[view], shown[-1]))
     sheet = io.contact_sheet(tinted, columns=2)
-    every = {number: names.get(number, "") for number in np.unique(object_id).tolist() if number > 0}
+    every = {number: names.get(number, "") for number in np.unique(labels.object_id).tolist() if number > 0}
     legend = legend_sheet(every, image=views.images[chosen[0]], ids=shown[0], width=sheet.shape[1])
     return np.concatenate([sheet, legend])
 

@@ -117,7 +117,7 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
         ids = jnp.asarray(sorted({0, only}), jnp.int32)
         votes = jnp.zeros((count, len(ids)), jnp.int32)
         return Labels(jnp.full(count, only, jnp.int32), votes, jnp.ones(count), ids=ids)
-    views = inputs.views.subset("train") if "train" in inputs.views.splits else inputs.views
+    views = inputs.views.training
     assert views.masks is not None
     check_ids_occur(inputs.ids, views.masks)
     labels = lift(

@@ -22,12 +22,12 @@ from pigjax.mpm import Particles, vast_grid
 from pigjax.mpm.active_grid import Fit, devices_for
 from pigjax.mpm.sleep import Sleeper
 from pigjax.mpm.timestep import first_substeps, frame_substeps
-from pigjax.objects.overlay import id_image, legend_sheet, overlay
+from pigjax.objects.overlay import legend_sheet, overlay
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
 from pigjax.scene.report import RunReport
 from pigjax.scene.schema import Scene
-from pigjax.segmentation import Labels
+from pigjax.segmentation import Labels, pixel_ids
 from pigjax.splat import Gaussians, render
 
 _SHEET_FRAMES = 12
@@ -265,24 +265,14 @@ def _draw(
     io.write_video(out / "video.mp4", pictures(), fps=scene.simulation.fps)
     tell("draw", frames + 1, frames + 1)
     io.write_image(out / "contact_sheet.png", io.contact_sheet(sheet))
-    _draw_objects(inputs, labels, cameras[0], background, sheet[0], out / "objects.png")
+    _draw_objects(inputs, labels, cameras[0], sheet[0], out / "objects.png")
     for name in (*_FILES, "states"):
         report.files[name.split(".")[0]] = str(out / name)
 
 
-def _draw_objects(
-    inputs: Inputs, labels: Labels, camera: Camera, background: Any, image: np.ndarray, path: Path
-) -> None:
+def _draw_objects(inputs: Inputs, labels: Labels, camera: Camera, image: np.ndarray, path: Path) -> None:
     """The first frame with its objects tinted, and the legend below."""
-    object_id = np.asarray(labels.object_id)
-    known = np.unique(np.concatenate([[0], np.maximum(object_id, 0)]))
-    # the unseen, -1, are of none
-    membership = jnp.asarray(object_id[:, None] == known, inputs.gaussians.means.dtype)
-    frame = render(
-        inputs.gaussians, camera, outputs=("object_weights",), object_weights=membership, background=background
-    )
-    assert frame.object_weights is not None
-    ids = id_image(frame.object_weights, ids=known)
+    ids, _ = pixel_ids(inputs.gaussians, labels, camera)
     names = {number: name for name, number in inputs.ids.items()}
     tinted = overlay(image, ids)
     legend = legend_sheet(names, image=image, ids=ids, width=tinted.shape[1])

@@ -118,8 +118,8 @@ def voting(scene: Scene, *, temperature: float | None = None) -> Voting:
     check_ids_occur(inputs.ids, inputs.views.masks)
     masks, number = _compact(inputs.views.masks, inputs.ids.values())
     views = eqx.tree_at(lambda v: v.masks, inputs.views, masks)
-    if {"train", "test"} <= set(views.splits):
-        train, held = views.subset("train"), views.subset("test")
+    train, held = views.training, views.held_out
+    if held is not None and "train" in views.splits:
         shown, hidden = (train.cameras, train.masks), (held.cameras, held.masks)
     else:
         every = np.arange(len(views.cameras)) % 4 == 3

@@ -33,9 +33,9 @@ from pigjax.cli.evaluating import evaluate_files
 from pigjax.core.errors import InputError, MissingFileError
 from pigjax.core.metrics import MaskScores
 from pigjax.io import load_dataset, save_masks, write_image
-from pigjax.objects.evaluation import LEVELS, evaluate_labels, ground_prompts, pixel_ids, reference_view
+from pigjax.objects.evaluation import LEVELS, evaluate_labels, ground_prompts, reference_view
 from pigjax.objects.overlay import comparison_sheet
-from pigjax.segmentation import Labels
+from pigjax.segmentation import Labels, pixel_ids
 
 
 def iou(a, b):

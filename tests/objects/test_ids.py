@@ -16,7 +16,7 @@ from pigjax.core.camera import look_at, stack_cameras
 from pigjax.core.errors import InputError, SceneError
 from pigjax.io import id_named, load_masks, load_names, read_image
 from pigjax.objects.lifting import lift
-from pigjax.objects.overlay import colours_of, id_colours, id_image, overlay
+from pigjax.objects.overlay import colours_of, id_colours, overlay
 from pigjax.scene.plan import Inputs, _id_of, segment
 from pigjax.scene.schema import load_scene
 from pigjax.segmentation import lift_masks
@@ -187,8 +187,6 @@ def test_colours_of_ids_far_apart_are_those_of_the_list():
     np.testing.assert_array_equal(colours_of(np.arange(-1, 40)), id_colours(40)[np.maximum(np.arange(-1, 40), 0)])
     ids = np.array([[0, 2_000_000_000]])
     assert (overlay(np.zeros((1, 2, 3)), ids)[0, 0] == 0).all()
-    weights = jnp.asarray([[[0.1, 0.9], [0.2, 0.1]]])
-    assert id_image(weights, ids=np.array([0, 2_000_000_000])).tolist() == [[2_000_000_000, 0]]
 
 
 @pytest.mark.parametrize(
