@@ -443,7 +443,7 @@ REFUSED = {
         lambda: make_particles(jnp.zeros((1, 3), jnp.float32), volume=1e-40, table=TABLE),
         r"volume = .*e-41|volume = 1e-40|volume = 0",
     ),
-    "dx 0": (lambda: Grid(jnp.zeros(3), jnp.asarray(0.0), (16, 16, 16)), r"Grid\.dx = 0\.0: .* must be > 0 m"),
+    "dx 0": (lambda: Grid(jnp.zeros(3), jnp.asarray(0.0), (16, 16, 16)), r"Grid\.dx = 0\.0: must be > 0 m"),
     "dx < 0": (lambda: Grid(jnp.zeros(3), jnp.asarray(-1.0), (16, 16, 16)), r"Grid\.dx = -1\.0"),
     "dx NaN": (lambda: Grid(jnp.zeros(3), jnp.asarray(jnp.nan), (16, 16, 16)), r"Grid\.dx = nan"),
     "origin NaN": (lambda: Grid(jnp.full(3, jnp.nan), jnp.asarray(1.0), (16, 16, 16)), r"Grid\.origin = \[nan"),
