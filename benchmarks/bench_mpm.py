@@ -26,11 +26,11 @@ from tradeoff.points import in_turn
 
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, fit_grid, make_particles
-from pigjax.mpm.active_grid import Fit, whole
+from pigjax.mpm.active_grid import ActiveGrid, whole
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.materials import LAWS, Material, material_table
-from pigjax.mpm.program import run_frames
+from pigjax.mpm.program import StepInputs, run_frames
 from pigjax.mpm.sleep import Sleep, Sleeper
 
 DT = 1e-4  # the rivals' step
@@ -148,14 +148,18 @@ def laws(arguments):
 
 
 STAGES = {
-    "to_grid": "to the grid: windows are made",
+    "particles_to_grid": "to the grid: windows are made",
     "add_windows": "to the grid: windows are added",
-    "on_grid": "on the grid: velocities, boundaries",
+    "update_grid": "on the grid: velocities, boundaries",
     "take_windows": "to the particles: windows are read",
-    "from_grid": "to the particles: sums over windows",
+    "grid_to_particles": "to the particles: sums over windows",
     "law": "the law, and particles move",
     "health": "health, and what is not finite",
 }
+
+
+def step_inputs(substeps, gravity=DOWN):
+    return StepInputs(jnp.float32(DT), substeps, jnp.asarray(gravity), jnp.float32(0))
 
 
 def stages(arguments):
@@ -167,10 +171,9 @@ def stages(arguments):
         for count, nodes in CASES:
             particles, _, table = scene(law, count, nodes)
             box = whole(fit_grid(particles.x, 1 / nodes, margin=2 / nodes))
-            settings, step = SimConfig(devices=1), {"frames": 1, "substeps": steps, "start": jnp.float32(0)}
-            step |= {"dt": jnp.float32(DT), "gravity": jnp.asarray(DOWN), "colliders": (), "contact": None}
-            compiled = run_frames.lower(particles, box, table, settings, 1, **step).compile().compiled
-            run = partial(run_frames, particles, box, table, settings, 1, **step)
+            settings, inputs = SimConfig(devices=1), step_inputs(steps)
+            compiled = run_frames.lower(particles, box, table, settings, 1, inputs, frames=1).compile().compiled
+            run = partial(run_frames, particles, box, table, settings, 1, inputs, frames=1)
             _, seconds, _ = timed(run)
             own = seconds_by_scope(compiled, run, STAGES)
             scale = seconds / sum(own.values()) / count / steps * 1e9
@@ -246,18 +249,17 @@ def sleep(arguments):
     x = jnp.where(flying[:, None], (particles.x - 0.35) * 0.5 + jnp.asarray([1.0, 0.4, 0.4]), particles.x)
     v = jnp.where(flying[:, None], jnp.asarray([0.0, 0.0, -1.0]), 0.0)
     particles = eqx.tree_at(lambda p: (p.x, p.v, p.body), particles, (x, v, flying.astype(jnp.int32)))
-    settings, step = SimConfig(devices=1), {"frames": 1, "substeps": 20, "start": jnp.float32(0)}
-    step |= {"dt": jnp.float32(DT), "gravity": jnp.zeros(3), "colliders": (), "contact": None}
+    settings, inputs = SimConfig(devices=1), step_inputs(20, gravity=(0.0, 0.0, 0.0))
     print("| asleep | ms per frame | against no sleep | compile s |")
     print("|---|---|---|---|")
     base = None
     for name, asleep in (("sleep=None", None), ("none", (0, 0)), ("the block", (1, 0)), ("both", (1, 1))):
-        fit = Fit() if asleep is None else Sleeper(settings=Sleep(), body=np.asarray(particles.body))
+        fit = ActiveGrid() if asleep is None else Sleeper(settings=Sleep(), body=np.asarray(particles.body))
 
         def frame(fit=fit, asleep=asleep):
             if asleep is not None:  # as it was, for each window
                 fit.asleep, fit.still = np.array(asleep, bool), 99 * np.array(asleep)
-            return fit.frame(particles, grid, table, settings, 1, **step)
+            return fit.frame(particles, grid, table, settings, 1, inputs)
 
         first, seconds, _ = timed(frame)
         base = base or seconds
@@ -291,9 +293,9 @@ def memory(arguments):
     for count, nodes in ((100_000, 64), (500_000, 128)):
         particles, _, table = scene("fixed_corotated", count, nodes)
         grid = fit_grid(particles.x, 1 / nodes, margin=2 / nodes)
-        settings, step = SimConfig(substeps=32, devices=1), {"frames": 1, "substeps": 32, "start": jnp.float32(0)}
-        step |= {"dt": jnp.float32(DT), "gravity": jnp.asarray(DOWN), "colliders": (), "contact": None}
-        used = run_frames.lower(particles, whole(grid), table, settings, 1, **step).compile().compiled.memory_analysis()
+        settings = SimConfig(substeps=32, devices=1)
+        lowered = run_frames.lower(particles, whole(grid), table, settings, 1, step_inputs(32), frames=1)
+        used = lowered.compile().compiled.memory_analysis()
 
         def height(x, particles=particles, grid=grid, table=table, settings=settings):
             moved = eqx.tree_at(lambda p: p.x, particles, x)

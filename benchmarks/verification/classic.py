@@ -2,7 +2,7 @@
 
 Classic MPM (Sulsky, Chen and Schreyer 1994, doi 10.1016/0045-7825(94)90112-0) takes both the internal force,
 fᵢ = −Σ V P Fᵀ ∇wᵢ, and the velocity gradient that F follows, Σ vᵢ ∇wᵢᵀ, from the gradients of the weights. MLS-MPM has
-APIC's moments in their place, which it needs anyway. Order of particles, chunks, windows, stages, transfers of mass and
+APIC's moments in their place, which it needs anyway. Order of particles, chunks, windows, transfers of mass and
 velocity (APIC), law and grid are the same code in both.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import fit_grid, substep, transfers
 from pigjax.mpm.by_law import by_component
-from pigjax.mpm.transfers import stage
+from pigjax.mpm.transfers import no_fuse
 from verification.bars import period
 from verification.common import NO_GRAVITY, Case, Row, elastic, in_float64, particles, percent
 from verification.kernels import KERNELS, energy_kept, ringing, turning
@@ -31,21 +31,21 @@ def classic_force():
     """Inside, steps use the gradients of the weights."""
     jax.clear_caches()
     try:
-        with patch.multiple(substep, _give=_give, _take=_take):
+        with patch.multiple(substep, _scatter_chunk=_scatter_chunk, _gather_chunk=_gather_chunk):
             yield
     finally:
         jax.clear_caches()
 
 
-def _give(setting, go, at, chunk, shared):
-    """Windows of a chunk, as `substep._give`."""
-    (dt, dx), kernel = shared, setting.kernel
+def _scatter_chunk(statics, opaque_true, at, chunk, shared):
+    """Windows of a chunk, as `substep._scatter_chunk`."""
+    (dt, dx), kernel = shared, statics.kernel
 
     def bring(distance, v, C, stress, mass, volume):
         impulse = -(dt / dx) * volume * by_component(stress)
         impulses = jnp.concatenate([jnp.zeros_like(impulse[:1]), impulse]).swapaxes(0, 1)
-        polynomial = transfers.brought(distance, mass[0], v, dx * mass * by_component(C))
-        return polynomial, [impulse.T for impulse in impulses], transfers._steep(kernel, distance)
+        polynomial = transfers.affine_momentum(distance, mass[0], v, dx * mass * by_component(C))
+        return polynomial, [impulse.T for impulse in impulses], transfers._weights_and_slopes(kernel, distance)
 
     def planes(plane, by_y, by_z, polynomial, impulses):
         constant, x, *others = polynomial
@@ -57,32 +57,32 @@ def _give(setting, go, at, chunk, shared):
         weights = along[:, 0], along[:, 1], steep[:, 2]
         return sum(w[:, :, None] * values[:, None] for w, values in zip(weights, (constant, slope, impulse)))
 
-    polynomial, impulses, (along, *others) = stage(go, bring, at.distance, *chunk)
-    rows = stage(go, planes, at.plane, *others, polynomial, impulses)
+    polynomial, impulses, (along, *others) = no_fuse(opaque_true, bring, at.distance, *chunk)
+    rows = no_fuse(opaque_true, planes, at.plane, *others, polynomial, impulses)
     flat = [nodes.reshape(len(nodes), -1) for nodes in rows]
-    return stage(go, windows, at.along, along, *flat).reshape(*at.rows.shape, -1)
+    return no_fuse(opaque_true, windows, at.along, along, *flat).reshape(*at.rows.shape, -1)
 
 
-def _take(setting, shape, bodies, law, go, at, windows, state, shared):
-    """A chunk after the step, and its tally, as `substep._take`."""
-    (dt, dx, parameters, inner), kernel = shared, setting.kernel
+def _gather_chunk(statics, shape, bodies, law, opaque_true, at, windows, state, shared):
+    """A chunk after the step, and its health, as `substep._gather_chunk`."""
+    (dt, dx, parameters, inner), kernel = shared, statics.kernel
 
     def gradients(read, plane):
         pairs = (plane, read.planes[:, 2]), (read.by_y, read.planes[:, 0]), (read.by_z, read.planes[:, 0])
         return tuple((w[:, :, None] * u.reshape(*w.shape, -1)).sum(1) for w, u in pairs)
 
     def respond(state, moments, gradient, dt, dx, parameters):
-        v, affine = transfers.apic(kernel, at.distance, moments)
+        v, affine = transfers.velocity_and_gradient(kernel, at.distance, moments)
         gradient = jnp.stack([rows.T[:3] for rows in gradient], 1)
         return substep._respond(law, substep.by_components(state), v, gradient, dt, dx, parameters)._replace(
             C=affine / dx
         )
 
-    read = transfers._read(kernel, go, at, windows)
-    gradient = stage(go, gradients, read, at.plane)
-    moments = transfers._moments(kernel, go, read.planes, at.plane)
-    new = substep.in_rows(stage(go, respond, state, moments, gradient, dt, dx, parameters))
-    return substep._settle(shape, bodies, go, new, state, inner)
+    read = transfers._row_sums(kernel, opaque_true, at, windows)
+    gradient = no_fuse(opaque_true, gradients, read, at.plane)
+    moments = transfers._moments(kernel, opaque_true, read.planes, at.plane)
+    new = substep.in_rows(no_fuse(opaque_true, respond, state, moments, gradient, dt, dx, parameters))
+    return substep._settle(shape, bodies, opaque_true, new, state, inner)
 
 
 def _figures(kernel):
