@@ -15,10 +15,11 @@ from pigjax.coupling.binding import deform
 from pigjax.coupling.seeding import seed_particles
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import fit_grid, make_particles, vast_grid
-from pigjax.mpm.active_grid import Fit
+from pigjax.mpm.active_grid import ActiveGrid
 from pigjax.mpm.colliders import Plane, Sphere
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.materials import Material, material_table
+from pigjax.mpm.program import StepInputs
 from pigjax.objects.association import associate_masks
 from pigjax.objects.editing import extract_object, hole_mask
 from pigjax.reconstruction.prune import contributions
@@ -170,9 +171,9 @@ def test_a_frame_has_the_precision_of_the_particles(x64, dtype):
     x = np.random.default_rng(0).uniform(0.2, 0.4, (40, 3)).astype(dtype)
     particles = make_particles(x, volume=1e-6, table=table)
     floor = Plane(point=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]))
-    after, path, _ = Fit().frame(
-        particles, vast_grid(0.1), table, SimConfig(), 1, dt=jnp.asarray(1e-3), gravity=jnp.asarray([0.0, 0.0, -9.81]),
-        colliders=(floor,), contact=None, start=jnp.asarray(0.0), frames=1, substeps=2,
+    after, path, _ = ActiveGrid().frame(
+        particles, vast_grid(0.1), table, SimConfig(), 1,
+        StepInputs(jnp.asarray(1e-3), 2, jnp.asarray([0.0, 0.0, -9.81]), jnp.asarray(0.0), (floor,)),
     )  # fmt: skip
     assert precisions((after, path)) == {np.dtype(dtype)}
     np.testing.assert_allclose(after.v[:, 2].mean(), -9.81 * 2e-3, rtol=1e-3)

@@ -33,7 +33,7 @@ from pigjax.mpm.active_grid import box_for
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.materials import Material, MaterialTable, Parameters
-from pigjax.mpm.timestep import first_substeps, stable_dt
+from pigjax.mpm.timestep import stable_dt, substep_rule
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, render_config, segment
 from pigjax.scene.schema import Scene
 from pigjax.segmentation import Labels
@@ -358,15 +358,16 @@ def _fitted(made: Experiment, dx: float, extremes: list[Mapping[str, Any]], marg
     """With substeps and a grid that serve all extremes."""
     cases = [case for values in extremes if (case := made.with_parameters(values))._is_possible()]
 
-    def steps(case: Experiment) -> dict[str, Any]:
-        return {
-            "frames": case.frames,
-            "frame_dt": float(case.frame_dt),
-            "gravity": np.asarray(case.gravity),
-            "colliders": case.colliders,
-        }
-
-    config, _ = first_substeps(made.particles, made.grid, made.table, made.config, **steps(made))
+    config = substep_rule(
+        made.particles,
+        made.grid,
+        made.table,
+        made.config,
+        frames=made.frames,
+        frame_dt=float(made.frame_dt),
+        gravity=np.asarray(made.gravity),
+        colliders=made.colliders,
+    ).config
     reached, runs, substeps = [np.asarray(made.particles.x)], [], 1
     for case in cases:
         _, _, trajectory, health = replace(case, config=config).simulate()

@@ -540,7 +540,7 @@ SILENT_ONCE = {
     "min_J and max_courant are NaN once a particle is (substep.py: _check)": numbers_of_health,
     "float32 rounds away slow motion in stiff matter (substep.py: cells + dt/dx v)": slow_matter,
     "the square of a speed of 1e30 m/s overflows unseen (mls_mpm.py: _max_speed)": one_of_huge_speed,
-    "only stationary matter (substep.py: to_grid)": nothing_moves,
+    "only stationary matter (substep.py: particles_to_grid)": nothing_moves,
     "frame_dt < 0 (mls_mpm.py)": partial(refused, frame_dt=-1e-2),
     "frame_dt NaN (mls_mpm.py)": partial(refused, frame_dt=float("nan")),
     "gravity NaN (mls_mpm.py)": partial(refused, gravity=(0.0, 0.0, float("nan"))),

@@ -150,7 +150,7 @@ def test_a_run_names_the_setting_that_changed(folder, finished, name):
 def test_what_is_only_drawn_simulates_nothing(folder, finished, reached, section, monkeypatch):
     ((name, values),) = section.items()
     scene = scene_from({**SCENE, name: {**SCENE.get(name, {}), **values}}, folder=folder)
-    monkeypatch.setattr(run_module.Fit, "frame", None)
+    monkeypatch.setattr(run_module.ActiveGrid, "frame", None)
     reached(run_module, "_draw")
     with pytest.raises(Reached):
         run_scene(scene, finished)
