@@ -8,6 +8,7 @@ static capacity: splats that do not fit are dropped and counted.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -78,7 +79,8 @@ def scan_chunks(
         visit: function of one chunk, its alpha [k p] and its `Blend`; any array.
     """
     dtype, pixels = chunks.rows.dtype, config.tile**2
-    plane, pixel_row = (jax.ShapeDtypeStruct(shape, dtype) for shape in ((config.chunk, pixels), (pixels,)))
+    plane: Any = jax.ShapeDtypeStruct((config.chunk, pixels), dtype)
+    pixel_row: Any = jax.ShapeDtypeStruct((pixels,), dtype)
     one_chunk = jax.tree.map(lambda leaf: leaf[0], chunks)
     result = jax.eval_shape(visit, one_chunk, plane, Blend(plane, plane, pixel_row))
 
