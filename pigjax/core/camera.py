@@ -34,8 +34,8 @@ class Camera(eqx.Module):
     world_to_cam: Float[Array, "*batch 4 4"] = real_field(limits=Limits(nan=True))
     focal: Float[Array, "*batch 2"] = real_field(limits=Limits(0, above=True, unit="px"))
     centre: Float[Array, "*batch 2"] = real_field()  # principal point [px]
-    width: int = static_field(limits=Limits(1, 65536, unit="px"))
-    height: int = static_field(limits=Limits(1, 65536, unit="px"))
+    width: int = static_field(limits=Limits(1, 65536, unit="px"))  # of the image [px]
+    height: int = static_field(limits=Limits(1, 65536, unit="px"))  # of the image [px]
 
     def __check_init__(self):
         arrays = (self.world_to_cam, self.focal, self.centre)

@@ -27,7 +27,7 @@ class Grid(eqx.Module):
     """
 
     origin: Float[Array, "3"] = real_field()  # first node [m]
-    dx: Float[Array, ""] = real_field(limits=Limits(0, above=True, unit="m"))
+    dx: Float[Array, ""] = real_field(limits=Limits(0, above=True, unit="m"))  # spacing of the nodes [m]
     shape: tuple[int, int, int] = static_field(limits=Limits(1, LARGEST_WHOLE))
 
     def __check_init__(self):

@@ -23,7 +23,7 @@ from pigjax.cli import app
 from pigjax.cli.evaluating import evaluate_files
 from pigjax.cli.segmenting import segment_files
 from pigjax.core.errors import InputError, StaleError
-from pigjax.mpm import Health, Trajectory, perfect_health
+from pigjax.mpm import StepHealth, Trajectory
 from pigjax.scene import run as run_module
 from pigjax.scene import run_scene, scene_from
 from pigjax.study import load_study, sweep_study, tune_study
@@ -257,7 +257,7 @@ def flight(particles, grid, table, config, *, frames, frame_dt, **_):
     times = jnp.arange(1, frames + 1)[:, None, None] * frame_dt * table.wave_speed.max()
     paths = particles.x + times * jnp.ones(3)
     path = Trajectory(paths, *(jnp.repeat(a[None], frames, 0) for a in (particles.v, particles.F_visual)))
-    health = Health(**vars(perfect_health(paths.dtype)), substeps=jnp.asarray(100), first_bad_frame=jnp.asarray(-1))
+    health = StepHealth.perfect(paths.dtype).of_rollout(100, jnp.asarray(-1))
     return replace(particles, x=paths[-1]), path, health
 
 
