@@ -515,15 +515,15 @@ def test_errors_are_one_line_whatever_the_name(tmp_path, breaks):
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_a_folder_of_a_refused_command_is_free(segmenting, monkeypatch, tmp_path):
+def test_a_folder_of_a_refused_command_is_free(segment_two, monkeypatch, tmp_path):
     def refuse(*arguments, **options):
         raise InputError("weighting = 'x'")
 
     with monkeypatch.context() as patched:
-        patched.setattr(objects, "lift", refuse)
+        patched.setattr(segmenting, "lift", refuse)
         with pytest.raises(InputError, match="weighting"):
-            segmenting(tmp_path / "out", {1: "wrong"})
-    segmenting(tmp_path / "out", {1: "duck"})
+            segment_two(tmp_path / "out", {1: "wrong"})
+    segment_two(tmp_path / "out", {1: "duck"})
     assert (tmp_path / "out" / "labels.npz").is_file()
 
 
