@@ -52,7 +52,7 @@ class SimConfig(eqx.Module):
     # particles handled at once; None: 512 on a CPU, else all
     chunk: int | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_fields(self)
         if self.box is not None and not (
             isinstance(self.box, tuple)

@@ -33,7 +33,7 @@ class BodyContact(eqx.Module):
         converter=as_array, default=0.0, metadata={"limits": Limits(0.0, 1e6)}
     )  # Coulomb's coefficient
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         if not isinstance(self.bodies, int) or self.bodies < 2:
             raise InputError(f"BodyContact.bodies = {self.bodies}: contact needs two bodies or more.")
         check_fields(self)
@@ -76,13 +76,13 @@ class BodyContact(eqx.Module):
         return parted + jnp.where(met, missing / jnp.where(sharing > 0, sharing, 1.0), 0.0)
 
 
-def _middle(moments, volume):
-    """Of the matter in reach of each node [cells]."""
+def _middle(moments: Float[Array, "b x y z 3"], volume: Float[Array, "b x y z 1"]) -> Float[Array, "b x y z 3"]:
+    """Middle of the matter in reach of each node [cells]."""
     return moments / jnp.where(volume > 0, volume, 1.0)
 
 
-def _gradient(volume):
-    """Central differences [b x y z 3] of node volumes."""
+def _gradient(volume: Float[Array, "b x y z 1"]) -> Float[Array, "b x y z 3"]:
+    """Central differences of node volumes."""
     padded = jnp.pad(volume[..., 0], ((0, 0), (1, 1), (1, 1), (1, 1)))
     inner = slice(1, -1)
     return jnp.stack(

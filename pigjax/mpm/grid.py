@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -30,7 +32,7 @@ class Grid(eqx.Module):
     dx: Float[Array, ""] = array_field()  # [m]
     shape: tuple[int, int, int] = static_field()
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         if min(self.shape) < 2 * WALL + 2:
             raise InputError(f"Grid.shape = {self.shape}: every side needs {2 * WALL + 2} nodes or more.")
         if _is_concrete(self.dx) and not np.all(np.isfinite(self.dx) & (np.asarray(self.dx) > 0)):
@@ -100,5 +102,5 @@ def _round_up_size(nodes: int) -> int:
     return next(size for size in sizes if size >= nodes)
 
 
-def _is_concrete(value):
+def _is_concrete(value: Any) -> bool:
     return isinstance(value, jax.Array) and is_known(value)  # vmap takes grids of axis numbers

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -213,11 +213,22 @@ def frame_substeps(
     return next(-(-size // 2) for size in ladder if size >= 2 * needed)
 
 
-def _substeps_needed(particles, grid, table, config, frame_dt, gravity, colliders, *, fall, until):
-    """The fewest stable ones where matter may fall for a while [s] and colliders move until a time [s]."""
+def _substeps_needed(
+    particles: Particles,
+    grid: Grid,
+    table: MaterialTable,
+    config: SimConfig,
+    frame_dt: float,
+    gravity: Vector,
+    colliders: tuple[Collider, ...],
+    *,
+    fall: float,
+    until: float,
+) -> int:
+    """The fewest stable substeps where matter falls for at most `fall` [s] and colliders move until a time [s]."""
     pull = float(np.linalg.norm(gravity))
     height = float(grid.dx) * math.hypot(*grid.shape)
-    speed = _max_speed(particles, colliders, grid, until, way=lambda v: v * fall + pull * fall**2 / 2)
+    speed = _max_speed(particles, colliders, grid, until, displacement=lambda v: v * fall + pull * fall**2 / 2)
     speed = min(speed + pull * fall, math.sqrt(speed**2 + 2 * pull * height))
     limit = float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl, integrator=config.integrator))
     needed = frame_dt / limit * (1 - 1e-6) if limit > 0 else math.inf
@@ -229,34 +240,43 @@ def _substeps_needed(particles, grid, table, config, frame_dt, gravity, collider
     return math.ceil(needed)
 
 
-def is_open(grid):
+def is_open(grid: Grid) -> bool:
     """Whether the grid is so large that its walls are out of reach."""
     return math.prod(grid.shape) > LARGEST
 
 
-def _near(particles, grid):
+def _near(particles: Particles, grid: Grid) -> Grid:
     """The grid around the particles where they are; the given one if no particle is finite."""
     x = np.asarray(particles.x)
     return fit_grid(x, float(grid.dx)) if np.isfinite(x).all(1).any() else grid
 
 
-def _max_speed(particles, colliders, grid, until, way):
-    """Of particles now and of colliders until a time [s]; `way` tells how far matter gets [m] by its speed [m/s]."""
+def _max_speed(
+    particles: Particles,
+    colliders: tuple[Collider, ...],
+    grid: Grid,
+    until: float,
+    displacement: Callable[[float], float],
+) -> float:
+    """The largest speed [m/s] of particles now, and of colliders until a time [s].
+
+    `displacement` bounds how far matter gets [m] by its speed [m/s].
+    """
     fastest = float(_fastest(particles.v))
     moving = [collider for collider in colliders if collider.moves]
     if not moving:
         return fastest
     near, units = (_near(particles, grid) if is_open(grid) else grid), np.array(list(np.ndindex(2, 2, 2)))
     corners = np.asarray(near.origin) + float(near.dx) * units * (np.array(near.shape) - 1)
-    for _ in range(2 if is_open(grid) else 1):  # what a collider hits goes on as fast, and so gets farther
-        reached = corners + (2 * units - 1) * (way(fastest) if is_open(grid) else 0.0)
+    for _ in range(2 if is_open(grid) else 1):  # matter that a collider hits goes on as fast, and so gets farther
+        reached = corners + (2 * units - 1) * (displacement(fastest) if is_open(grid) else 0.0)
         points = jnp.asarray(reached, particles.x.dtype)
         fastest = max([fastest, *(float(collider.top_speed(points, until)) for collider in moving)])
     return fastest
 
 
 @jax.jit
-def _fastest(v):
+def _fastest(v: Float[Array, "p 3"]) -> Float[Array, ""]:
     """Speed of the fastest particle whose speed is finite; the square of a large one would not be."""
     speeds = jnp.hypot(jnp.hypot(v[:, 0], v[:, 1]), v[:, 2])
     return jnp.max(speeds, where=jnp.isfinite(speeds), initial=0.0)
@@ -284,9 +304,16 @@ def check_gravity(gravity: Any) -> None:
         raise InputError(f"gravity = {gravity}: its components must be finite [m/s²].")
 
 
-def longest_step(dt, particles, grid, table, config, colliders):
-    """The stable limit [s], with room for rounding, and the speed that it holds for [m/s]."""
-    speed = _max_speed(particles, colliders, grid, dt, way=lambda v: v * dt)
+def longest_step(
+    dt: float,
+    particles: Particles,
+    grid: Grid,
+    table: MaterialTable,
+    config: SimConfig,
+    colliders: tuple[Collider, ...],
+) -> tuple[float, float]:
+    """The stable limit [s], with room for rounding, and the largest speed [m/s], for which it holds."""
+    speed = _max_speed(particles, colliders, grid, dt, displacement=lambda v: v * dt)
     limit = float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl, integrator=config.integrator))
     return limit * (1 + 1e-5), speed
 

@@ -31,7 +31,7 @@ def number(**kwargs: Any) -> Any:
     return eqx.field(converter=_as_real, **kwargs)
 
 
-def _as_real(value):
+def _as_real(value: Any) -> Any:
     value = jnp.asarray(as_float(value)) if isinstance(value, int) and not isinstance(value, bool) else as_array(value)
     return value.astype(float) if isinstance(value, Array) and jnp.issubdtype(value.dtype, jnp.integer) else value
 
@@ -76,7 +76,7 @@ class Collider(eqx.Module):
     softness: Scalar | None = number(default=None, kw_only=True)  # width over which contact sets in [m]; None: hard
     mode: str = static_field(default="separate", kw_only=True)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         if self.mode not in MODES:
             raise InputError(f"mode = {self.mode!r}: choose one of {', '.join(MODES)}.")
         for field in dataclasses.fields(self):
@@ -168,7 +168,8 @@ class Collider(eqx.Module):
             return jnp.where(inside, touched, velocity)
         return velocity + inside * (touched - velocity)
 
-    def _allowed(self, relative, normal, press):
+    def _allowed(self, relative: Points, normal: Points, press: Press | None) -> Points:
+        """Velocities relative to the collider [m/s] that its mode leaves of others."""
         if self.mode == "sticky":
             return jnp.zeros_like(relative)
         speed = (relative * normal).sum(-1, keepdims=True)
@@ -187,18 +188,18 @@ class Collider(eqx.Module):
         kept = jnp.where(glides, 1 + self.friction * speed / jnp.where(glides & (glide > 0), glide, 1.0), 0.0)
         return jnp.where(speed < 0, kept * tangential, relative)
 
-    def _distance_and_normals(self, points, time):
+    def _distance_and_normals(self, points: Points, time: Time) -> tuple[Float[Array, "*n"], Points]:
         distance, pull = jax.vjp(lambda p: self.distance(p, time), points)
         return distance, safe_normalize(pull(jnp.ones_like(distance))[0])
 
     @property
-    def _pivot(self):
+    def _pivot(self) -> Float[Array, "3"]:
         return self.ball()[0] if self.pivot is None else self.pivot
 
-    def _pivot_at(self, time):
+    def _pivot_at(self, time: Time) -> Float[Array, "3"]:
         return self._pivot if self.velocity is None else self._pivot + self.velocity * (self.elapsed + time)
 
-    def _to_shape(self, points, time):
+    def _to_shape(self, points: Points, time: Time) -> Points:
         """The same points of the body where the shape's own numbers describe it."""
         turn = self.rotation
         if self.angular_velocity is not None:
@@ -209,7 +210,7 @@ class Collider(eqx.Module):
             return self._pivot + (from_pivot[..., :, None] * quat_to_matrix(turn)).sum(-2)
         return points if self.velocity is None else points - self.velocity * (self.elapsed + time)
 
-    def _own_velocity(self, points, time):
+    def _own_velocity(self, points: Points, time: Time) -> Float[Array, "*#n 3"] | None:
         if self.angular_velocity is None:
             return self.velocity
         spin = jnp.cross(self.angular_velocity, points - self._pivot_at(time))
@@ -221,7 +222,7 @@ def has_direction(vector: np.ndarray) -> Any:
     return np.square(vector, dtype=np.float64).sum(-1) > 1e-37
 
 
-def _quat_of_spin(vector):
+def _quat_of_spin(vector: Float[Array, "3"]) -> Float[Array, "4"]:
     """Unit quaternion that turns about a vector by its length [rad]."""
     angle = safe_norm(vector)
     return jnp.concatenate([jnp.cos(angle / 2)[None], vector * jnp.sinc(angle / (2 * np.pi)) / 2])

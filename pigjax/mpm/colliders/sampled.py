@@ -23,7 +23,7 @@ class SampledDistance(Collider):
     origin: Float[Array, "3"] = number()  # of sample 0, 0, 0 [m]
     dx: Scalar = number()  # [m]
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         self.require("dx", "the spacing of samples must be > 0 m", lambda dx: ~(dx <= 0))
         self.require("samples", "two or more are needed along every axis", lambda v: min(v.shape[-3:]) >= 2)
 

@@ -7,14 +7,15 @@ it, and test its stress or return point against a closed form.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pigjax.core.errors import InputError
 from pigjax.mpm.materials import elastic, fibres, fluid, foam, plastic, plasticine, snow
-from pigjax.mpm.materials.tensors import Scalars, Tensors, determinant, identity, product, spectral, svd
+from pigjax.mpm.materials.parameters import Parameters
+from pigjax.mpm.materials.tensors import Scalar, Scalars, Tensors, determinant, identity, product, spectral, svd
 
 
 class Response(NamedTuple):
@@ -35,7 +36,7 @@ class Law(NamedTuple):
     modulus: Callable[..., Scalars]  # of `Parameters`: the most that pressure waves meet at small stretches [Pa]
 
 
-def respond(model: str, F: Tensors, rate: Tensors, dt, hardening: Scalars | None, m) -> Response:
+def respond(model: str, F: Tensors, rate: Tensors, dt: Scalar, hardening: Scalars | None, m: Parameters) -> Response:
     """One step of law `model` from F with the velocity gradient `rate` [1/s] over dt [s].
 
     `m` is a `MaterialTable` with one row for each particle, or a single row. With dt = 0 it is the stress of F itself.
@@ -61,11 +62,19 @@ def law_of(model: str) -> Law:
     return LAWS[model]
 
 
-def _pressure_modulus(m) -> Scalars:
+Modulus: TypeAlias = Callable[..., Scalars]
+Flow: TypeAlias = Callable[..., tuple]
+
+
+def _pressure_modulus(m: Parameters) -> Scalars:
     return m.lam + 2 * m.mu
 
 
-def _elastic(stress, *, needs=(), modulus=_pressure_modulus) -> Law:
+def _elastic(
+    stress: Callable[..., Tensors], *, needs: tuple[str, ...] = (), modulus: Modulus = _pressure_modulus
+) -> Law:
+    """A hyperelastic law of `stress(F, m) -> τ`."""
+
     def step(F, rate, dt, hardening, m):
         F = F + dt * product(rate, F)
         return Response(F, hardening, stress(F, m))
@@ -73,7 +82,7 @@ def _elastic(stress, *, needs=(), modulus=_pressure_modulus) -> Law:
     return Law(step, ("young", "poisson", *needs), total=True, hardens=False, modulus=modulus)
 
 
-def _plastic(flow, *, needs, hardens=True, modulus=_pressure_modulus) -> Law:
+def _plastic(flow: Flow, *, needs: tuple[str, ...], hardens: bool = True, modulus: Modulus = _pressure_modulus) -> Law:
     """A law of `flow(trial stretches, hardening, dt, m) -> (stretches, hardening, principal stresses)`."""
 
     def step(F, rate, dt, hardening, m):
@@ -84,7 +93,9 @@ def _plastic(flow, *, needs, hardens=True, modulus=_pressure_modulus) -> Law:
     return Law(step, ("young", "poisson", *needs), total=False, hardens=hardens, modulus=modulus)
 
 
-def _hencky(return_map, stress=lambda strain, hardening, m: elastic.hencky_stress(strain, m)):
+def _hencky(
+    return_map: Callable, stress: Callable = lambda strain, hardening, m: elastic.hencky_stress(strain, m)
+) -> Flow:
     """Flow of stretches by a return map of Hencky strains."""
 
     def flow(stretches, hardening, dt, m):
@@ -94,17 +105,21 @@ def _hencky(return_map, stress=lambda strain, hardening, m: elastic.hencky_stres
     return flow
 
 
-def _snow(stretches, hardening, dt, m):
+def _snow(
+    stretches: Float[Array, "3 *n"], hardening: Scalars, dt: Scalar, m: Parameters
+) -> tuple[Float[Array, "3 *n"], Scalars, Float[Array, "3 *n"]]:
     stretches, hardening = snow.crumble(stretches, hardening, m)
     return stretches, hardening, snow.stress(stretches, hardening, m)
 
 
-def _foam(stretches, hardening, dt, m):
+def _foam(
+    stretches: Float[Array, "3 *n"], hardening: Scalars | None, dt: Scalar, m: Parameters
+) -> tuple[Float[Array, "3 *n"], Scalars | None, Float[Array, "3 *n"]]:
     strain = foam.herschel_bulkley(elastic.hencky_strain(stretches), dt, m)
     return jnp.exp(strain), hardening, elastic.hencky_stress(strain, m)
 
 
-def _fluid(F, rate, dt, hardening, m):
+def _fluid(F: Tensors, rate: Tensors, dt: Scalar, hardening: Scalars | None, m: Parameters) -> Response:
     J = fluid.volume_ratio(determinant(F), rate, dt)
     return Response(jnp.cbrt(J) * identity(F), hardening, fluid.newtonian(J, rate, m))
 
