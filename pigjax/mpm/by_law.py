@@ -1,7 +1,7 @@
 """Particles grouped by law: the form in which a simulation holds them.
 
-A law is traced for its own particles only, so that none pays for what it does not use. The user's order is restored
-outside.
+A law is traced for its own particles only, so that no scene pays for laws that it does not have. The user's order is
+restored at the end.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from pigjax.mpm.particles import Particles, Trajectory
 
 
 class Group(NamedTuple):
-    """What does not change of the particles of one law."""
+    """The constants of the particles of one law."""
 
     law: str  # static
     parameters: Parameters  # one row, or one for each material of the law
 
 
 class Grouping(NamedTuple):
-    """Particles taken apart by law, and the way back."""
+    """Particles split by law, and the inverse of the split."""
 
     groups: tuple[Group, ...]  # of the laws that move
     states: tuple[State, ...]
-    still: Particles | None  # matter that does not move
+    still: Particles | None  # stationary matter
     parts: list[Particles]  # of all laws
     moves: list[bool]
-    order: Array | None  # of the particles in the parts, None if it is the user's
+    order: Array | None  # of the particles in the parts; None: the user's
     apart: bool  # whether each body has a grid of its own, all behind each other along x
 
     def particles(self, states: tuple[State, ...], grid: Grid) -> Particles:
@@ -119,7 +119,7 @@ def by_row(tensors: Array) -> Array:
 
 
 def bound_visual(state: State, stretch: tuple[float, float]) -> State:
-    """Hold the stretches of F_visual in bounds: flow without end would otherwise draw needles."""
+    """State with the stretches of F_visual clipped: unbounded flow would otherwise be drawn as needles."""
     if state.visual is None:
         return state
     u, s, v = linalg.svd(state.visual.reshape(-1, 3, 3))
@@ -132,8 +132,8 @@ def _group(
 ) -> tuple[Group, State]:
     """Particles of one law with their present stress, at rest and without mass where they are not finite.
 
-    Those outside begin half a cell beyond where the wall holds them: near enough for the weights of the kernel, and
-    far enough to be counted.
+    Particles outside of the grid begin half a cell beyond the place where its edge holds them: near enough for the
+    weights of the kernel, and far enough to be counted.
     """
     kind, several = LAWS[law], len(rows) > 1
     parameters = table.rows(np.array(rows) if several else rows[0])
@@ -191,7 +191,7 @@ def _finite(trees: Any) -> Bool[Array, "p"]:
 
 
 def _ungroup(part: Particles, state: State, grid: Grid, apart: bool) -> Particles:
-    """Particles with the state that their group has reached; x is NaN of those that are no longer finite."""
+    """Particles with the state of their group; x is NaN where they are no longer finite."""
     state = jax.tree.map(lambda rows: rows[: len(part)], state)
     F = state.F.reshape(-1, 3, 3)
     return eqx.tree_at(

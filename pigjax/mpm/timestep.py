@@ -1,4 +1,4 @@
-"""Stable steps: the longest by the CFL bound, the integrator, and the substeps of a frame (host)."""
+"""Time steps: the longest stable one by the CFL bound, the integrator, and the substeps of a frame (host)."""
 
 from __future__ import annotations
 
@@ -34,10 +34,18 @@ def stable_dt(
     cfl: float = 0.4,
     integrator: str = "explicit",
 ) -> Float[Array, ""]:
-    """Longest stable step [s] of matter that moves at up to max_speed [m/s].
+    """Longest stable step [s].
 
-    No wave of the stiffest law crosses more than `cfl` cells, nor does viscous momentum diffuse too far for the grid.
-    Implicit steps only must not carry a particle over more than `cfl` cells.
+    Explicit: Δt = cfl min(dx / (c + v), dx² / 4ν) with c the fastest pressure wave, v the speed of matter and ν the
+    largest kinematic viscosity (the bound of Courant, Friedrichs and Lewy, and that of diffusion). Implicit:
+    Δt = cfl dx / v.
+
+    Args:
+        table: materials.
+        grid: its dx counts.
+        max_speed: of matter and colliders [m/s].
+        cfl: largest displacement in a step [cells]; the default is that of `SimConfig`.
+        integrator: "explicit" or "implicit".
 
     Raises:
         InputError: the integrator is neither "explicit" nor "implicit".
@@ -104,9 +112,19 @@ def choose_substeps(
 ) -> int:
     """Substeps per frame that keep a rollout stable (host).
 
-    The speed that falling can reach, by time or by the size of the grid, counts beside the present one. The number is
-    rounded up by at most an eighth, so that similar scenes share one compilation. It serves every frame of a rollout;
-    in a domain without walls (`vast_grid`) `rollout` begins with fewer, see `substep_rule`.
+    The speed that a fall can reach, bounded by its time and by the size of the grid, adds to the present one. The
+    number is rounded up by at most an eighth, so that similar scenes share one compilation. It serves every frame of a
+    rollout; in a domain without walls (`vast_grid`) `rollout` begins with fewer, see `substep_rule`.
+
+    Args:
+        particles: at the start.
+        grid: the whole domain.
+        table: materials.
+        config: its `integrator` and `cfl` count.
+        frames: number of frames, 1 or more.
+        frame_dt: duration of a frame [s].
+        gravity: [m/s²].
+        colliders: as they are at the start.
 
     Raises:
         InputError: a number is out of range, or no step is stable.
@@ -166,7 +184,7 @@ def substep_rule(
     gravity: Vector,
     colliders: tuple[Collider, ...] = (),
 ) -> SubstepRule:
-    """The rule for a simulation that begins with these particles (host): `config.substeps`, or else what is stable.
+    """The rule for a simulation that begins with these particles (host): `config.substeps`, or the fewest stable ones.
 
     The arguments are those of `choose_substeps`. In a domain without walls within reach (`vast_grid`) only time bounds
     how far matter falls, and few scenes fall for all of it. There a simulation begins with the substeps of a fall
@@ -204,8 +222,8 @@ def frame_substeps(
     """Substeps of one frame, numbered from 0, by the speeds at its beginning (host).
 
     It is `first`, or where that is too few the next of `first` times 1.5, 2, 3, 4, 6, ..., so that a long fall costs
-    few compilations. The state at the beginning of the frame decides alone: a simulation that goes on from there
-    chooses the same.
+    few compilations. It depends on the state at the beginning of the frame alone, so that a resumed simulation takes
+    the same number.
     """
     until = (frame + 1) * frame_dt
     needed = _substeps_needed(particles, grid, table, config, frame_dt, gravity, colliders, fall=frame_dt, until=until)
@@ -246,7 +264,7 @@ def is_open(grid: Grid) -> bool:
 
 
 def _near(particles: Particles, grid: Grid) -> Grid:
-    """The grid around the particles where they are; the given one if no particle is finite."""
+    """The grid around the present positions of the particles; the given one if no particle is finite."""
     x = np.asarray(particles.x)
     return fit_grid(x, float(grid.dx)) if np.isfinite(x).all(1).any() else grid
 
@@ -277,13 +295,13 @@ def _max_speed(
 
 @jax.jit
 def _fastest(v: Float[Array, "p 3"]) -> Float[Array, ""]:
-    """Speed of the fastest particle whose speed is finite; the square of a large one would not be."""
+    """Speed of the fastest particle whose speed is finite, without squares, which would overflow."""
     speeds = jnp.hypot(jnp.hypot(v[:, 0], v[:, 1]), v[:, 2])
     return jnp.max(speeds, where=jnp.isfinite(speeds), initial=0.0)
 
 
 def check_steps(frames: Any, frame_dt: Any, gravity: Any) -> None:
-    """Refuse a number of frames, a time between them [s] or a gravity [m/s²] that no rollout takes (InputError)."""
+    """Raise an InputError for a number of frames, a frame_dt [s] or a gravity [m/s²] that no rollout takes."""
     if isinstance(frames, bool) or not isinstance(frames, int | np.integer) or frames < 1:
         raise InputError(f"frames = {frames}: must be a whole number, 1 or more.")
     check_gravity(gravity)
@@ -295,7 +313,7 @@ def check_steps(frames: Any, frame_dt: Any, gravity: Any) -> None:
 
 
 def check_gravity(gravity: Any) -> None:
-    """Refuse a gravity that has not three finite components [m/s²] (InputError)."""
+    """Raise an InputError for a gravity without three finite components [m/s²]."""
     if np.shape(gravity) != (3,):
         raise InputError(f"gravity has shape {np.shape(gravity)}: it must have three components [m/s²].")
     if not is_known(gravity):
@@ -326,7 +344,7 @@ def check_dt(
     config: SimConfig,
     colliders: tuple[Collider, ...],
 ) -> None:
-    """Refuse a step [s] above the stable limit, unless `config.force` (InputError)."""
+    """Raise an InputError for a step [s] above the stable limit, unless `config.force`."""
     limit, speed = longest_step(dt, particles, grid, table, config, colliders)
     if dt > limit and not config.force:
         raise InputError(

@@ -1,4 +1,8 @@
-"""What all colliders share: pose and motion, contact by mode, and checks of their numbers."""
+"""The base of all colliders: pose and motion, contact by mode, and checks of their numbers.
+
+In explicit steps contact projects node velocities (`Collider.apply`), at once or over the width `softness`. In implicit
+steps colliders are compliant (penalty) constraints, as stiff as the matter (`implicit.newton`).
+"""
 
 from __future__ import annotations
 
@@ -37,18 +41,18 @@ def _as_real(value: Any) -> Any:
 
 
 class Contact(NamedTuple):
-    """A collider as the grid sees it."""
+    """Contact of a collider with points, such as the nodes of the grid."""
 
-    inside: Bool[Array, "*n"] | Float[Array, "*n"]  # or the share of a soft contact
+    inside: Bool[Array, "*n"] | Float[Array, "*n"]  # a share from 0 to 1 where contact is soft
     normal: Float[Array, "*n 3"]
     velocity: Float[Array, "*#n 3"] | None = None  # of the collider's matter at the points [m/s]; None: at rest
 
 
 class Press(NamedTuple):
-    """How nodes press against a collider, where that is known beforehand."""
+    """How nodes press against a collider, where an earlier solve has found it."""
 
-    speed: Float[Array, "*n 1"]  # [m/s]: friction takes at most its coefficient times this from what glides
-    secant: bool = False  # whether friction has the derivative of a drag of the strength that it happens to have
+    speed: Float[Array, "*n 1"]  # [m/s]: friction takes at most its coefficient times this from the gliding speed
+    secant: bool = False  # whether the derivative of friction is that of a drag of its present strength
 
 
 class Collider(eqx.Module):
@@ -56,11 +60,11 @@ class Collider(eqx.Module):
 
     Modes: "sticky" holds matter, "slip" lets it glide but not leave, "separate" lets it glide with Coulomb friction and
     leave. At the start of a rollout the shape stands turned by `rotation` about `pivot`; from there it moves with
-    `velocity` and turns with `angular_velocity` about the pivot, which moves along. All may be differentiated. What is
-    None is not traced.
+    `velocity` and turns with `angular_velocity` about the pivot, which moves along. All may be differentiated. Fields
+    that are None are not traced.
 
     Whether a point is inside is a hard test, which has no derivative: a rollout can be differentiated by friction, by
-    velocities and, through the normals, by the pose, but a plane shifted along its normal changes nothing until it
+    velocities and, through the normals, by the pose, but a plane shifted along its normal has no effect until it
     passes a node. With a `softness`, contact sets in smoothly over that width, and so all of the pose counts.
 
     Raises:
@@ -98,7 +102,7 @@ class Collider(eqx.Module):
             raise InputError(f"{name} = {shown}: {rule}.")
 
     def _check_types(self) -> None:
-        """Whether every number is one, and every vector has its length: what the rules of subclasses stand on."""
+        """Whether every number is one, and every vector has its length, as the rules of subclasses assume."""
         for field in dataclasses.fields(self):
             value, kind = getattr(self, field.name), str(field.type)
             traced = isinstance(value, jax.core.Tracer)
@@ -155,12 +159,12 @@ class Collider(eqx.Module):
             return speed
         middle, radius = self.ball()
         reach = safe_norm(middle - self._pivot) + radius
-        # the way from a pivot that moves straight is convex in time: the longest is at the start or at the end
+        # the distance from a pivot that moves straight is convex in time: the largest is at the start or at the end
         longest = [safe_norm(points - self._pivot_at(time)).max() for time in (0.0, duration)]
         return speed + safe_norm(self.angular_velocity) * jnp.minimum(reach, jnp.maximum(*longest))
 
     def apply(self, contact: Contact, velocity: Points, press: Press | None = None) -> Points:
-        """Velocities of grid nodes [m/s] after they met it, with friction by how they did so or as `press` says."""
+        """Velocities of grid nodes [m/s] after contact, with friction by their normal velocity or by `press`."""
         own = 0.0 if contact.velocity is None else contact.velocity
         touched = own + self._allowed(velocity - own, contact.normal, press)
         inside = contact.inside[..., None]
@@ -183,7 +187,7 @@ class Collider(eqx.Module):
             drag = lax.stop_gradient(drag) if press.secant else drag
             return (1 - drag) * tangential + jnp.maximum(speed, 0.0) * normal
         # Coulomb: the tangential impulse is at most the friction coefficient times the normal one, which is -speed.
-        # What is too slow to glide is not divided by: the slope at next to no glide would be infinite times nothing.
+        # No division by speeds too slow to glide: the slope at almost no glide would be infinity times zero.
         glides = (speed < 0) & (glide >= -self.friction * speed)
         kept = jnp.where(glides, 1 + self.friction * speed / jnp.where(glides & (glide > 0), glide, 1.0), 0.0)
         return jnp.where(speed < 0, kept * tangential, relative)

@@ -28,7 +28,7 @@ class SampledDistance(Collider):
         self.require("samples", "two or more are needed along every axis", lambda v: min(v.shape[-3:]) >= 2)
 
     def shape_distance(self, points: Points) -> Float[Array, "*n"]:
-        """By trilinear interpolation; beyond the lattice, at least the way to it."""
+        """By trilinear interpolation; beyond the lattice, at least the distance to it."""
         cells = (points - self.origin) / self.dx
         last = jnp.asarray(self.samples.shape) - 1
         low = jnp.clip(jnp.floor(lax.stop_gradient(cells)).astype(int), 0, last - 1)

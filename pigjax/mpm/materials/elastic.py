@@ -61,10 +61,10 @@ def stvk_hencky(F: Tensors, m: Parameters) -> Tensors:
 
 
 def _orientation(measure: Scalars) -> Scalars:
-    """1 for matter right side out, 0 where it is flat, −1 where it is inside out by more than the floor of logarithms.
+    """1 for matter that is not inverted, 0 where it is flat, −1 where it is inverted by more than the floor.
 
-    What is inside out pulls itself together. Were its pressure kept, it would push its surroundings apart without end,
-    since F grows and shrinks by factors and turns no more.
+    Inverted matter then pulls itself together. With the pressure of the law it would push its surroundings apart
+    without end, since F only grows and shrinks by factors and cannot turn back.
     """
     return jnp.where(measure > 0, 1.0, jnp.maximum(measure / _SMALLEST_STRETCH, -1.0))
 
@@ -121,6 +121,6 @@ def _first_invariant(b: Tensors, J: Scalars) -> Scalars:
             y = newton(y, *fixed)
         return y
 
-    # A loop, where what is unrolled would be computed anew by XLA for each of its many uses; of few rounds, which cost.
+    # A loop, since XLA would recompute unrolled iterations for each of their many uses; of few rounds, which cost.
     y = lax.fori_loop(0, 2, half_of_them, jnp.sqrt(3 * fixed[0]))
     return newton(newton(y, *coefficients), *coefficients)

@@ -25,7 +25,7 @@ def newtonian(J: Scalars, rate: Tensors, m: Parameters) -> Tensors:
 def volume_ratio(J: Scalars, rate: Tensors, dt: Scalar) -> Scalars:
     """J after a step, J (1 + dt tr ∇v): the determinant of I + dt ∇v would let mere rotation create volume.
 
-    From no volume at all, or less, it starts anew at rest: pressed to the least volume it would burst.
+    Matter with J <= 0 restarts at its rest volume: at the least volume of the clip it would burst.
     """
     J = jnp.where(J > 0, J, 1.0)
     divergence = rate[0, 0] + rate[1, 1] + rate[2, 2]

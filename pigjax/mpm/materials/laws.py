@@ -1,7 +1,7 @@
-"""The laws by name, all with one face: one step of a particle's elastic state, and the stress after it.
+"""The laws by name, all with one signature: one step of a particle's elastic state, and the stress after it.
 
-To add a law: write its stress or return map in the module of its kind, wrap it here with what the stages must know of
-it, and test its stress or return point against a closed form.
+To add a law: write its stress or return map in the module of its kind, wrap it here as a `Law`, and test its stress or
+return point against a closed form.
 """
 
 from __future__ import annotations
@@ -27,20 +27,25 @@ class Response(NamedTuple):
 
 
 class Law(NamedTuple):
-    """A constitutive law: `respond(F, rate, dt, hardening, m)`, and what the stages around it must know of it."""
+    """A constitutive law: `respond(F, rate, dt, hardening, m)`, and its properties that the steps need."""
 
     respond: Callable[..., Response] | None  # None: matter that never moves
     needs: tuple[str, ...]  # material parameters that must be given
     total: bool  # whether F is the total deformation, so that F_visual is F
     hardens: bool  # whether the law has an internal variable, which is 0 at first
-    modulus: Callable[..., Scalars]  # of `Parameters`: the most that pressure waves meet at small stretches [Pa]
+    modulus: Callable[..., Scalars]  # of `Parameters`: largest modulus of pressure waves at small stretches [Pa]
 
 
 def respond(model: str, F: Tensors, rate: Tensors, dt: Scalar, hardening: Scalars | None, m: Parameters) -> Response:
-    """One step of law `model` from F with the velocity gradient `rate` [1/s] over dt [s].
+    """One step of a law: the elastic state after dt, and its Kirchhoff stress.
 
-    `m` is a `MaterialTable` with one row for each particle, or a single row. With dt = 0 it is the stress of F itself.
-    The internal variable `hardening` may be None where the law has none (`Law.hardens`).
+    Args:
+        model: name of the law, a key of `LAWS`.
+        F: elastic deformation gradients at the beginning of the step.
+        rate: velocity gradients [1/s].
+        dt: duration [s]; 0 for the stress of F itself, which plastic laws return to their yield surface.
+        hardening: internal variable; may be None where the law has none (`Law.hardens`).
+        m: parameters of one material, or of the material of each particle.
 
     Raises:
         InputError: the model is unknown or does not move.
@@ -55,7 +60,7 @@ def law_of(model: str) -> Law:
     """The law of that name.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no law of that name.
     """
     if model not in LAWS:
         raise InputError(f"Material model {model!r} is unknown: choose one of {', '.join(sorted(LAWS))}.")

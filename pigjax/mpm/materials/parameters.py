@@ -22,7 +22,7 @@ def _as_number(value: Any) -> Any:
 
 
 class Parameters(eqx.Module):
-    """The numbers of one material, or of several, in SI units. A law ignores those that it has no use for."""
+    """The numbers of one material, or of several, in SI units. A law ignores numbers that it does not read."""
 
     density: Float[Array, "*m"] = _number()  # at rest [kg/m³]
     young: Float[Array, "*m"] = _number(default=0.0)  # Young's modulus [Pa]

@@ -31,7 +31,7 @@ def damage(hardening: Scalars, m: Parameters) -> Scalars:
 def stress(strain: Strains, hardening: Scalars, m: Parameters) -> Strains:
     """Principal Kirchhoff stresses [Pa]: (1 − D) (2μ dev ε + K ⟨tr ε⟩₊) − K ⟨−tr ε⟩₊, with K the bulk modulus.
 
-    Within ‖dev τ‖ <= √(2/3) σ_y(α): softened to a residual of zero, matter bears pressure and nothing else.
+    Within ‖dev τ‖ <= √(2/3) σ_y(α): softened to a residual of zero, matter bears only pressure.
     """
     kept = 1 - damage(hardening, m)
     volumetric = strain.sum(0)

@@ -16,7 +16,7 @@ Stretches = Float[Array, "3 *n"]
 _LARGEST_HARDENING = 10.0  # packed snow is this many times as stiff at most; steps stay stable up to there
 _LOOSEST = math.log(
     20.0
-)  # of log Jp that hardening reads: beyond, snow is powder without stress, and nothing overflows
+)  # bound of log Jp in the hardening factor: beyond, snow is powder without stress, and exp must not overflow
 
 
 def crumble(stretches: Stretches, hardening: Scalars, m: Parameters) -> tuple[Stretches, Scalars]:
@@ -35,7 +35,7 @@ def hardening_factor(hardening: Scalars, m: Parameters) -> Scalars:
 
 
 def largest_hardening_factor(m: Parameters) -> Scalars:
-    """What `hardening_factor` tends to as snow is packed without end."""
+    """Limit of `hardening_factor` as snow is packed."""
     return jnp.exp(jnp.minimum(m.hardening_coefficient, math.log(_LARGEST_HARDENING)))
 
 

@@ -52,7 +52,7 @@ class Material(Parameters):
                 )
 
 
-# What each number is called, and its range where a law needs it or it is given.
+# The noun of each number, and its range where a law needs it or it is given.
 LIMITS: dict[str, tuple[str, Limits]] = {
     "density": ("the density", Limits(0, 1e9, above=True, unit="kg/m³")),
     "young": ("Young's modulus", Limits(0, above=True, unit="Pa")),
@@ -73,7 +73,7 @@ LIMITS: dict[str, tuple[str, Limits]] = {
     "fibre_azimuth": ("the azimuth of fibres", Limits(-1e6, 1e6, unit="rad")),
     "fibre_elevation": ("the elevation of fibres", Limits(-1e6, 1e6, unit="rad")),
 }
-# Laws, and what must hold between the numbers of one material.
+# Rules between the numbers of one material, by law.
 _JOINT_LIMITS = (
     (
         "hardening_modulus",
@@ -136,7 +136,7 @@ def material_table(materials: Sequence[Material]) -> MaterialTable:
     """Table with one row for each material, in their order.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no material.
     """
     if not materials:
         raise InputError("material_table needs at least one material.")
