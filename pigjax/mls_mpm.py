@@ -1,7 +1,31 @@
-"""MLS-MPM (Hu et al. 2018, doi 10.1145/3197517.3201293) with APIC: one explicit step, and whole rollouts.
+"""MLS-MPM with APIC: one step (`step`) and whole rollouts (`rollout`).
 
-A rollout of known numbers goes frame by frame on the box of the grid that its particles need (`boxes`); inside jit,
-grad and vmap it is one program on the whole grid, or on a box of fixed size that moves. `substep` holds the equations.
+One substep for particles p with mass m, rest volume V, position x, velocity v, affine velocity C, deformation gradient
+F and Kirchhoff stress τ, for nodes i with B-spline weights wᵢₚ, and D = dx²/4 (quadratic) or dx²/3 (cubic):
+
+    P2G          mᵢ = Σₚ wᵢₚ mₚ                                                    transfers, chunked
+                 (m v)ᵢ = Σₚ wᵢₚ (mₚ vₚ + (mₚ Cₚ − Δt Vₚ τₚ D⁻¹) (xᵢ − xₚ))
+    grid update  vᵢ = (m v)ᵢ / mᵢ + Δt g, then contact, colliders and walls        substep, contact, colliders, implicit
+    G2P          vₚ = Σᵢ wᵢₚ vᵢ,  Cₚ = D⁻¹ Σᵢ wᵢₚ vᵢ (xᵢ − xₚ)ᵀ,  xₚ += Δt vₚ        transfers, chunked
+    F update     Fₚ and τₚ from (I + Δt Cₚ) Fₚ by the law of the matter              materials
+
+The affine momentum m C (x − xₚ) is APIC's (Jiang et al. 2015, doi 10.1145/2766996), its stress term that of MLS-MPM
+(Hu et al. 2018, doi 10.1145/3197517.3201293, eqs. 16 and 29), the F update eq. 181 of Jiang et al. 2016
+(doi 10.1145/2897826.2927348). `mpm.substep` reads in these stages, and `mpm.reference` is the same on plain arrays.
+`mpm.simulate` loops over frames, `mpm.active_grid` fits the part of the grid that a frame needs, `mpm.program` compiles
+its substeps, `mpm.timestep` finds a stable Δt.
+
+Reverse mode nests three rules. Each recomputes instead of storing, and the adjoint of a scatter is a gather:
+
+    program.run_frames                         frames
+    └─ adjoint.run_steps                       steps: checkpoints, recomputed blocks, back-propagation step by step
+       ├─ substep.particles_to_grid
+       │  └─ chunked.scatter_chunks            chunks: each is recomputed, its adjoint gathers the grid's cotangent
+       │     └─ transfers.scatter_window_vjp   windows: the adjoint of a particle's scatter is its gather
+       ├─ substep.update_grid                  no rule: JAX differentiates it; implicit steps by the implicit function
+       └─ substep.grid_to_particles
+          └─ chunked.gather_chunks             chunks: each is recomputed, its adjoint scatters to the cotangent
+             └─ transfers.gather_window_vjp    windows: the adjoint of a particle's gather is its scatter
 """
 
 from __future__ import annotations
@@ -58,14 +82,27 @@ def step(
     colliders: tuple[Collider, ...] = (),
     contact: BodyContact | None = None,
 ) -> tuple[Particles, StepHealth]:
-    """One step of dt [s] under gravity [m/s²]: particles to grid, grid update, grid to particles.
+    """One step: particles to grid (P2G), grid update, grid to particles (G2P).
 
-    It sorts the particles anew; many steps cost less in one `rollout`. With the integrator "auto" it is explicit where
-    dt is stable for that, else implicit.
+    Each call sorts the particles, so that many steps cost less in one `rollout`.
+
+    Args:
+        particles: p of them, in any order of materials.
+        grid: the whole domain; matter outside is held at its edge.
+        table: materials, as the particles were made for.
+        config: compiled-in choices. With the integrator "auto" the step is explicit where dt is stable for that, else
+            implicit.
+        dt: [s].
+        gravity: [m/s²].
+        colliders: as they are at the beginning of the step.
+        contact: between the bodies of `Particles.body`; None, the default: they share one velocity field.
+
+    Returns:
+        Particles in the same order, and the health of the step.
 
     Raises:
-        InputError: dt is not >= 0 and finite, or above `stable_dt` (seen outside of jit only, the latter unless
-            `config.force`), or the integrator is "auto" inside jit, grad or vmap.
+        InputError: dt is not >= 0 and finite, or above `stable_dt` (outside of jit only, the latter unless
+            `config.force`); the integrator is "auto" inside jit, grad or vmap; the particles do not fit the table.
     """
     _check_table(particles, table)
     _check_contact(particles, config, contact)
@@ -98,18 +135,33 @@ def rollout(
     contact: BodyContact | None = None,
     sleep: Sleep | None = None,
 ) -> tuple[Particles, Trajectory, Health]:
-    """Simulate `frames` frames of frame_dt [s] each under gravity [m/s²].
+    """Simulate frames of substeps.
 
-    Called with known numbers it visits only the part of the grid that matter is in. Inside jit, grad and vmap the whole
-    grid is held, or a box of `config.box` nodes of it that moves with matter: give one that `fit_grid` has fitted.
-    Reverse mode holds states in number about the root of all steps and computes the others anew, see `rewind`; with a
-    box it also keeps what each frame was set up with.
-    With `sleep`, bodies at rest are left out until something comes near them (outside of jit, grad and vmap only, since
-    it is decided between frames).
+    With concrete arrays, only the active part of the grid is allocated. Inside jit, grad and vmap the whole grid is, or
+    a window of `config.box` nodes that moves with matter: give a grid that `fit_grid` has fitted. Reverse mode keeps
+    O(√n) checkpoints of n steps and recomputes the states between them (Griewank and Walther 2000), and with a window
+    also the inputs of each frame.
+
+    Args:
+        particles: p of them, in any order of materials.
+        grid: the whole domain.
+        table: materials, as the particles were made for.
+        config: compiled-in choices. Its `substeps` may be None outside of jit, grad and vmap: the fewest that are
+            stable.
+        frames: number of frames, 1 or more.
+        frame_dt: duration of a frame [s].
+        gravity: [m/s²].
+        colliders: as they are at the start.
+        contact: between the bodies of `Particles.body`; None, the default: they share one velocity field.
+        sleep: when bodies at rest are left out until another one comes near; None, the default: never. Outside of jit,
+            grad and vmap only, since it is decided between frames.
+
+    Returns:
+        Particles after the last frame, the path with one entry for each frame, and the worst health of all steps.
 
     Raises:
-        InputError: config.substeps is None or `sleep` is given inside jit, grad or vmap, or the step is above
-            `stable_dt` (seen outside of those only, and unless `config.force`).
+        InputError: config.substeps is None or `sleep` is given inside jit, grad or vmap; the step is above `stable_dt`
+            (outside of those only, and unless `config.force`); the particles do not fit the table.
         SimulationError: matter has spread so far that its grid would not fit into memory (outside of those only).
     """
     _check_table(particles, table)
@@ -183,7 +235,7 @@ def _compiled(
 
 
 def _like(tree: Any, particles: Particles) -> Any:
-    """Numbers in the precision of the particles."""
+    """The same tree of numbers in the precision of the particles."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, particles.x.dtype), tree)
 
 

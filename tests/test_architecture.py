@@ -142,6 +142,32 @@ def test_modules_are_short():
         assert len(path.read_text().splitlines()) <= 600, f"{path.name}: one idea each, at most 600 lines"
 
 
+ANNOTATED = ("mpm",)  # packages whose functions the type checker of the tests sees
+
+
+def functions_of(node, name=""):
+    """Functions of a module and methods of its classes; the inner ones of a function see what it has checked."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.ClassDef):
+            yield from functions_of(child, f"{name}{child.name}.")
+        elif isinstance(child, ast.FunctionDef):
+            yield f"{name}{child.name}", child
+
+
+@pytest.mark.parametrize("package", ANNOTATED)
+def test_every_argument_and_result_is_annotated(package):
+    bare = []
+    for path in sorted((PACKAGE / package).rglob("*.py")):
+        for name, function in functions_of(ast.parse(path.read_text())):
+            own = function.args
+            arguments = [*own.posonlyargs, *own.args, *own.kwonlyargs, own.vararg, own.kwarg]
+            missing = [a.arg for a in arguments if a and a.annotation is None and a.arg not in ("self", "cls")]
+            missing += ["the result"] if function.returns is None else []
+            if missing:
+                bare.append(f"{path.relative_to(PACKAGE)}:{function.lineno} {name}: {', '.join(missing)}")
+    assert bare == []
+
+
 def test_import_is_fast_and_changes_no_configuration():
     code = """
 import time

@@ -1,18 +1,19 @@
 """Particles grouped by law: the form in which a simulation holds them.
 
-A law is traced for its own particles only, so that none pays for what it does not use. The user's order is restored
-outside.
+A law is traced for its own particles only, so that no scene pays for laws that it does not have. The user's order is
+restored at the end.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core import linalg
 from pigjax.core.errors import InputError
@@ -23,21 +24,21 @@ from pigjax.mpm.particles import Particles, Trajectory
 
 
 class Group(NamedTuple):
-    """What does not change of the particles of one law."""
+    """The constants of the particles of one law."""
 
     law: str  # static
     parameters: Parameters  # one row, or one for each material of the law
 
 
 class Grouping(NamedTuple):
-    """Particles taken apart by law, and the way back."""
+    """Particles split by law, and the inverse of the split."""
 
     groups: tuple[Group, ...]  # of the laws that move
     states: tuple[State, ...]
-    still: Particles | None  # matter that does not move
+    still: Particles | None  # stationary matter
     parts: list[Particles]  # of all laws
     moves: list[bool]
-    order: Array | None  # of the particles in the parts, None if it is the user's
+    order: Array | None  # of the particles in the parts; None: the user's
     apart: bool  # whether each body has a grid of its own, all behind each other along x
 
     def particles(self, states: tuple[State, ...], grid: Grid) -> Particles:
@@ -66,7 +67,8 @@ class Grouping(NamedTuple):
         full = [[jnp.broadcast_to(a, (frames, *a.shape[1:])) for a in piece] for piece in pieces]
         return Trajectory(*(self._merge(arrays, axis=1) for arrays in zip(*full)))
 
-    def _merge(self, pieces, axis=0):
+    def _merge(self, pieces: Sequence[Array], axis: int = 0) -> Array:
+        """Arrays of the laws as one, in the user's order along an axis."""
         merged = jnp.concatenate(pieces, axis)
         return merged if self.order is None else jnp.take(merged, inverse(self.order), axis)
 
@@ -117,7 +119,7 @@ def by_row(tensors: Array) -> Array:
 
 
 def bound_visual(state: State, stretch: tuple[float, float]) -> State:
-    """Hold the stretches of F_visual in bounds: flow without end would otherwise draw needles."""
+    """State with the stretches of F_visual clipped: unbounded flow would otherwise be drawn as needles."""
     if state.visual is None:
         return state
     u, s, v = linalg.svd(state.visual.reshape(-1, 3, 3))
@@ -125,11 +127,13 @@ def bound_visual(state: State, stretch: tuple[float, float]) -> State:
     return state._replace(visual=linalg.matmul3(u * s[..., None, :], linalg.transpose(v)).reshape(-1, 9))
 
 
-def _group(law, part, rows, table, grid, pieces, apart):
+def _group(
+    law: str, part: Particles, rows: list[int], table: MaterialTable, grid: Grid, pieces: int, apart: bool
+) -> tuple[Group, State]:
     """Particles of one law with their present stress, at rest and without mass where they are not finite.
 
-    Those outside begin half a cell beyond where the wall holds them: near enough for the weights of the kernel, and
-    far enough to be counted.
+    Particles outside of the grid begin half a cell beyond the place where its edge holds them: near enough for the
+    weights of the kernel, and far enough to be counted.
     """
     kind, several = LAWS[law], len(rows) > 1
     parameters = table.rows(np.array(rows) if several else rows[0])
@@ -181,13 +185,13 @@ def _group(law, part, rows, table, grid, pieces, apart):
     return Group(law, parameters), state
 
 
-def _finite(trees):
+def _finite(trees: Any) -> Bool[Array, "p"]:
     """Which particles are finite in every row."""
     return jnp.isfinite(sum(rows.sum(-1) for rows in jax.tree.leaves(trees)))
 
 
-def _ungroup(part, state, grid, apart):
-    """Particles with the state that their group has reached; x is NaN of those that are no longer finite."""
+def _ungroup(part: Particles, state: State, grid: Grid, apart: bool) -> Particles:
+    """Particles with the state of their group; x is NaN where they are no longer finite."""
     state = jax.tree.map(lambda rows: rows[: len(part)], state)
     F = state.F.reshape(-1, 3, 3)
     return eqx.tree_at(
@@ -204,20 +208,21 @@ def _ungroup(part, state, grid, apart):
     )
 
 
-def _positions(part, state, grid, apart):
+def _positions(part: Particles, state: State, grid: Grid, apart: bool) -> Float[Array, "*t p 3"]:
+    """Positions [m]; NaN for particles that are no longer finite."""
     cells = state.cells - (_own_grid(part, grid) if apart else 0)
     return jnp.where(state.volume > 0, grid.origin + grid.dx * cells, jnp.nan)
 
 
-def _own_grid(part, grid):
-    """Where the grid of a particle's body begins [cells]."""
+def _own_grid(part: Particles, grid: Grid) -> Float[Array, "p 3"]:
+    """First node of the grid of each particle's body [cells]."""
     return (part.body[:, None] * grid.shape[0] * np.eye(1, 3, dtype=int)).astype(part.x.dtype)
 
 
-def _split(particles, sizes):
+def _split(particles: Particles, sizes: list[int]) -> list[Particles]:
     ends = np.cumsum(sizes)
     return [jax.tree.map(lambda a, low=end - size, high=end: a[low:high], particles) for size, end in zip(sizes, ends)]
 
 
-def _reorder(particles, order):
+def _reorder(particles: Particles, order: Int[Array, "p"]) -> Particles:
     return jax.tree.map(lambda array: array[order], particles)

@@ -1,4 +1,4 @@
-"""Every choice of a simulation that is compiled in."""
+"""The configuration of a simulation: every choice that is compiled in."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _DIFFERENTIATION = ("reverse", "forward")
 class SimConfig(eqx.Module):
     """Every choice of the simulation that is compiled in.
 
-    The outer nodes of a grid are walls. Without `walls` they hold as "separate" does, and matter that moves into them
-    is counted (`Health.wall_hits`) and `rollout` warns of it, since there the grid ended and not the world. To name a
-    kind of wall says that it belongs to the scene: nothing is counted then.
+    The outer nodes of a grid are walls. Without `walls` they act as "separate" ones, and matter that moves into them is
+    counted (`Health.wall_hits`) and `rollout` warns of it, since it met the end of the grid and no part of the scene. A
+    named kind of wall is a part of the scene, and its hits are not counted.
 
     Raises:
         InputError: a choice does not exist or a number is out of range.
@@ -32,28 +32,28 @@ class SimConfig(eqx.Module):
     integrator: str = static_field(default="explicit", choices=_INTEGRATORS)
     # per frame; None: the fewest that are stable
     substeps: int | None = static_field(default=None, limits=Limits(1, 100_000_000))
-    # share of a cell that waves and particles cross in a step
+    # largest displacement of waves and particles in a step [cells]; 0.4 leaves room for stiffening
     cfl: float = static_field(default=0.4, limits=Limits(0, 1, above=True))
-    # that the scene wants: "separate", "slip" or "sticky"; None: as "separate", and particles that meet it are counted
+    # of the scene: "separate", "slip" or "sticky"; None: as "separate", and particles that meet them are counted
     walls: str | None = static_field(default=None, choices=_WALLS)
     # bounds of F_visual's singular values
     visual_stretch: tuple[float, float] = static_field(default=(0.2, 5.0), limits=Limits(0, above=True))
     force: bool = static_field(default=False)  # run steps longer than the stable limit
     stop: bool = static_field(default=False)  # at the first bad frame: the rest repeats the last good one
     newton_steps: int = static_field(default=30, limits=Limits(1, 1_000_000))  # of an implicit step, at most
-    # momentum out of balance, relative to what drives the step
+    # residual momentum, relative to the impulses that drive the step
     newton_tolerance: float = static_field(default=1e-3, limits=Limits(0, 1, above=True))
     krylov_steps: int = static_field(default=300, limits=Limits(1, 1_000_000))  # of a Newton step, at most
-    # nodes that move with matter in jit, grad and vmap
+    # nodes of a window that moves with matter in jit, grad and vmap
     box: tuple[int, int, int] | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
-    # that share the particles; None: all local ones, if it pays
+    # that share the particles; None: all local ones, where there are enough particles
     devices: int | None = static_field(default=None, limits=Limits(1, 100_000))
     # or "forward": for jvp, jacfwd and hessian
     differentiation: str = static_field(default="reverse", choices=_DIFFERENTIATION)
     # particles handled at once; None: 512 on a CPU, else all
     chunk: int | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_fields(self)
         if self.box is not None and not (
             isinstance(self.box, tuple)

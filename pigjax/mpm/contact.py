@@ -15,10 +15,10 @@ from pigjax.core.checks import Limits, check_fields
 from pigjax.core.errors import InputError
 from pigjax.core.linalg import safe_norm, safe_normalize
 
-# Distance of the middles of what two touching half spaces have within a node's reach [cells]: 0.81 at a node on their
+# Distance of the centres of two touching half spaces within a node's reach [cells]: 0.81 at a node on their
 # border, 0.9 half a cell off it (the idea: Nairn and Guilkey 2015, doi 10.1002/nme.4834, sec. 3).
 _TOUCHING = 0.9
-_SHARED = 0.1  # least share of a body in the volume at a node where it may touch: less is another body's mere edge
+_SHARED = 0.1  # least share of a body in the volume at a node of contact: a smaller one is only the edge of the body
 
 
 class BodyContact(eqx.Module):
@@ -28,12 +28,12 @@ class BodyContact(eqx.Module):
         InputError: there are fewer than two bodies, or the friction is negative.
     """
 
-    bodies: int = static_field()  # how many; particles have bodies 0 to this number - 1
+    bodies: int = static_field()  # number of bodies; particles have bodies 0 to this number - 1
     friction: Float[Array, ""] = eqx.field(
         converter=as_array, default=0.0, metadata={"limits": Limits(0.0, 1e6)}
     )  # Coulomb's coefficient
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         if not isinstance(self.bodies, int) or self.bodies < 2:
             raise InputError(f"BodyContact.bodies = {self.bodies}: contact needs two bodies or more.")
         check_fields(self)
@@ -45,22 +45,28 @@ class BodyContact(eqx.Module):
         volume: Float[Array, "b x y z 1"],
         moments: Float[Array, "b x y z 3"],
     ) -> Float[Array, "b x y z 3"]:
-        """Velocities of each body's nodes [m/s] after the bodies met; momentum is kept.
+        """Velocities of each body's nodes [m/s] after contact; momentum is conserved.
 
-        `moments` are Σ w V x of the matter in reach of a node: where it is [cells].
+        Args:
+            velocity: before contact [m/s].
+            mass: in units of the heaviest particle.
+            volume: at rest [cells].
+            moments: Σ w V x of the matter in reach of a node, with x in cells.
         """
         total = mass.sum(0)
         common = (mass * velocity).sum(0) / jnp.where(total > 0, total, 1.0)
         others = volume.sum(0) - volume
-        # Out of the body into the others, which is where these grow by as much as it falls. What falls or grows of both
-        # alike is their ends side by side, and what changes of one only is its own edge: neither tilts the normal.
-        # Opposite for two bodies, so that their impulses are too.
+        # The normal points out of the body into the others, where their volume grows by as much as its own falls. Where
+        # both change alike their ends lie side by side, and where one changes alone it has an edge: neither tilts the
+        # normal. Normals of two bodies are opposite, so that their impulses are too.
         growth, fall = _gradient(others) * volume, -_gradient(volume) * others
         less = jnp.where(jnp.abs(growth) < jnp.abs(fall), growth, fall)
         normal = safe_normalize(jnp.where((growth > 0) == (fall > 0), less, 0.0))
-        way = _middle(moments.sum(0) - moments, others) - _middle(moments, volume)
-        gap = (way * normal).sum(-1, keepdims=True)
-        aside = safe_norm(way - gap * normal)[..., None]  # far where the normal of an edge is not that of the faces
+        distance = _middle(moments.sum(0) - moments, others) - _middle(moments, volume)
+        gap = (distance * normal).sum(-1, keepdims=True)
+        aside = safe_norm(distance - gap * normal)[
+            ..., None
+        ]  # large where the normal of an edge is not that of the faces
         near = (gap < _TOUCHING) & (aside < _TOUCHING) & (jnp.minimum(volume, others) > _SHARED * (volume + others))
 
         relative = velocity - common
@@ -76,13 +82,13 @@ class BodyContact(eqx.Module):
         return parted + jnp.where(met, missing / jnp.where(sharing > 0, sharing, 1.0), 0.0)
 
 
-def _middle(moments, volume):
-    """Of the matter in reach of each node [cells]."""
+def _middle(moments: Float[Array, "b x y z 3"], volume: Float[Array, "b x y z 1"]) -> Float[Array, "b x y z 3"]:
+    """Middle of the matter in reach of each node [cells]."""
     return moments / jnp.where(volume > 0, volume, 1.0)
 
 
-def _gradient(volume):
-    """Central differences [b x y z 3] of node volumes."""
+def _gradient(volume: Float[Array, "b x y z 1"]) -> Float[Array, "b x y z 3"]:
+    """Central differences of node volumes."""
     padded = jnp.pad(volume[..., 0], ((0, 0), (1, 1), (1, 1), (1, 1)))
     inner = slice(1, -1)
     return jnp.stack(

@@ -1,4 +1,4 @@
-"""The background grid: a box of nodes, fitted to particles or without walls within reach."""
+"""The background grid: a box of nodes, fitted to particles (`fit_grid`) or without walls within reach (`vast_grid`)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Grid(eqx.Module):
     dx: Float[Array, ""] = real_field(limits=Limits(0, above=True, unit="m"))  # spacing of the nodes [m]
     shape: tuple[int, int, int] = static_field(limits=Limits(1, LARGEST_WHOLE))
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_fields(self)
         if min(self.shape) < 2 * WALL + 2:
             raise InputError(f"Grid.shape = {self.shape}: every side needs {2 * WALL + 2} nodes or more.")
@@ -39,7 +39,7 @@ class Grid(eqx.Module):
     def points(self) -> Float[Array, "nx ny nz 3"]:
         """Positions of the nodes [m]; those of multiples of dx are the same, to the digit, wherever the grid begins.
 
-        Else a plane that lies on a layer of nodes would hold it or not as rounding will.
+        Otherwise rounding would decide whether a plane on a layer of nodes holds these nodes.
         """
         first = lax.stop_gradient(jnp.round(self.origin / self.dx))
         rest = self.origin - self.dx * first
@@ -53,7 +53,7 @@ class Grid(eqx.Module):
 def fit_grid(x: Float[Array, "p 3"] | np.ndarray, dx: float, *, margin: float = 0.0) -> Grid:
     """Grid around the particles with `margin` [m] of room inside its walls (host).
 
-    Nodes lie on multiples of dx and sides have 2ᵏ or 3·2ᵏ nodes, so that a grid fitted anew to moved matter mostly
+    Nodes lie on multiples of dx and sides have 2ᵏ or 3·2ᵏ nodes, so that a grid re-fitted to moved matter mostly
     has the old shape and always the old lattice.
 
     Raises:
@@ -85,7 +85,7 @@ def fit_grid(x: Float[Array, "p 3"] | np.ndarray, dx: float, *, margin: float = 
 def vast_grid(dx: float) -> Grid:
     """A domain of a million cells a side around the world's origin, for matter that no wall holds.
 
-    Only what `rollout` visits of it is ever held, called outside of jit, grad and vmap.
+    Outside of jit, grad and vmap only its active part is ever allocated.
     """
     nodes = 1 << 20
     return Grid(jnp.full(3, -(nodes // 2) * dx), jnp.asarray(dx, float), (nodes,) * 3)

@@ -1,4 +1,4 @@
-"""Particles in chunks that a CPU's cache holds, neighbours in space beside each other."""
+"""Memory layout of particles: chunks that fit the cache of a CPU, neighbours in space beside each other."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ _LANES = 16  # of a machine vector
 _PARTICLES = 512  # of a chunk on a CPU: their windows fit its second-level cache
 
 
-Rows: TypeAlias = Any  # an array, or None where the scene has no use for it
+Rows: TypeAlias = Any  # an array, or None where the law does not need it
 
 
 class State(NamedTuple):
-    """What a simulation holds of the particles of one law: rows of `[p rows]`, or in chunks `[n rows c]`."""
+    """State of the particles of one law: arrays `[p rows]`, or in chunks `[n rows c]`."""
 
     cells: Rows  # position in cells from the first node, 3 rows
-    rounded: Rows  # what rounding has added to the cells so far, 3 (Kahan 1965, doi 10.1145/363707.363723)
+    rounded: Rows  # rounding error of the cells so far, 3 (Kahan 1965, doi 10.1145/363707.363723)
     v: Rows  # [m/s], 3
     C: Rows  # velocity gradient [1/s], 9
     F: Rows  # elastic deformation gradient, 9
-    stress: Rows  # Kirchhoff, of F [Pa], 9: the return map that finds F finds it too
-    mass: Rows  # [kg], 1; 0 for what is no longer finite
+    stress: Rows  # Kirchhoff, of F [Pa], 9: the law computes it together with F
+    mass: Rows  # [kg], 1; 0 for particles that are no longer finite
     volume: Rows  # at rest [m³], 1
     hardening: Rows  # 1; None where the law has none
     visual: Rows  # total deformation, 9; None where F is that
@@ -59,7 +59,7 @@ def to_rows(chunks: State, count: int) -> State:
 
 
 def tile_order(cells: Float[Array, "p 3"], shape: tuple[int, int, int]) -> Int[Array, "p"]:
-    """The particles' numbers, tile by tile."""
+    """Indices of the particles, sorted by tile of the grid."""
     sides = [-(-n // _TILE) for n in shape]
     place = (lax.stop_gradient(cells) / _TILE).astype(jnp.int32)
     x, y, z = (jnp.clip(place[:, k], 0, side - 1) for k, side in enumerate(sides))
@@ -67,7 +67,7 @@ def tile_order(cells: Float[Array, "p 3"], shape: tuple[int, int, int]) -> Int[A
 
 
 def order_of(keys: Int[Array, "p"], most: int) -> Int[Array, "p"]:
-    """Positions that the sorted keys, all from 0 to `most` - 1, had; equal keys stay in order.
+    """Indices that sort the keys, which are from 0 to `most` - 1; equal keys stay in order.
 
     XLA:CPU sorts one operand several times as fast as two.
     """
@@ -79,5 +79,5 @@ def order_of(keys: Int[Array, "p"], most: int) -> Int[Array, "p"]:
 
 
 def inverse(order: Int[Array, "p"]) -> Int[Array, "p"]:
-    """The permutation that undoes it; found by a sort it would take as long as a substep."""
+    """The inverse permutation, by a scatter: a sort would take as long as a substep."""
     return jnp.zeros_like(order).at[order].set(jnp.arange(len(order), dtype=order.dtype), unique_indices=True)

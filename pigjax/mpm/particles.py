@@ -35,7 +35,7 @@ class Particles(eqx.Module):
     material: Int[Array, "p"] = array_field()  # row of the material table
     hardening: Float[Array, "p"] = real_field()  # internal variable of the plastic laws
     gaussian: Int[Array, "p"] = array_field()  # index of the Gaussian it carries, -1 for none
-    body: Int[Array, "p"] = array_field()  # what `BodyContact` keeps apart
+    body: Int[Array, "p"] = array_field()  # number of its body, for `BodyContact` and `Sleep`
     counts: tuple[int, ...] = static_field()  # particles of each row, which sizes the groups by law
 
     def __check_init__(self):
@@ -46,7 +46,7 @@ class Particles(eqx.Module):
 
 
 class Trajectory(eqx.Module):
-    """What moved, one entry per frame, after the frame."""
+    """The path of the particles: their state after each of t frames."""
 
     x: Float[Array, "t p 3"]  # [m]
     v: Float[Array, "t p 3"]  # [m/s]

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -138,7 +139,8 @@ def simulate_compiled(
         worst = worst.combine(health.of_step())
         return (after, worst, stopped), (jax.tree.map(lambda rows: rows[0], path), bad)
 
-    carry = (particles, StepHealth.perfect(particles.x.dtype), jnp.zeros((), bool))
+    perfect = replace(StepHealth.perfect(particles.x.dtype), sides_met=None)
+    carry = (particles, perfect, jnp.zeros((), bool))
     (end, worst, _), (path, bad) = lax.scan(frame, carry, jnp.arange(frames))
     return end, path, worst.of_rollout(inputs.substeps, _first(bad))
 

@@ -1,9 +1,9 @@
-"""Stable steps: the longest by the CFL bound, the integrator, and the substeps of a frame (host)."""
+"""Time steps: the longest stable one by the CFL bound, the integrator, and the substeps of a frame (host)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -34,10 +34,18 @@ def stable_dt(
     cfl: float = 0.4,
     integrator: str = "explicit",
 ) -> Float[Array, ""]:
-    """Longest stable step [s] of matter that moves at up to max_speed [m/s].
+    """Longest stable step [s].
 
-    No wave of the stiffest law crosses more than `cfl` cells, nor does viscous momentum diffuse too far for the grid.
-    Implicit steps only must not carry a particle over more than `cfl` cells.
+    Explicit: Δt = cfl min(dx / (c + v), dx² / 4ν) with c the fastest pressure wave, v the speed of matter and ν the
+    largest kinematic viscosity (the bound of Courant, Friedrichs and Lewy, and that of diffusion). Implicit:
+    Δt = cfl dx / v.
+
+    Args:
+        table: materials.
+        grid: its dx counts.
+        max_speed: of matter and colliders [m/s].
+        cfl: largest displacement in a step [cells]; the default is that of `SimConfig`.
+        integrator: "explicit" or "implicit".
 
     Raises:
         InputError: the integrator is neither "explicit" nor "implicit".
@@ -104,9 +112,19 @@ def choose_substeps(
 ) -> int:
     """Substeps per frame that keep a rollout stable (host).
 
-    The speed that falling can reach, by time or by the size of the grid, counts beside the present one. The number is
-    rounded up by at most an eighth, so that similar scenes share one compilation. It serves every frame of a rollout;
-    in a domain without walls (`vast_grid`) `rollout` begins with fewer, see `substep_rule`.
+    The speed that a fall can reach, bounded by its time and by the size of the grid, adds to the present one. The
+    number is rounded up by at most an eighth, so that similar scenes share one compilation. It serves every frame of a
+    rollout; in a domain without walls (`vast_grid`) `rollout` begins with fewer, see `substep_rule`.
+
+    Args:
+        particles: at the start.
+        grid: the whole domain.
+        table: materials.
+        config: its `integrator` and `cfl` count.
+        frames: number of frames, 1 or more.
+        frame_dt: duration of a frame [s].
+        gravity: [m/s²].
+        colliders: as they are at the start.
 
     Raises:
         InputError: a number is out of range, or no step is stable.
@@ -166,7 +184,7 @@ def substep_rule(
     gravity: Vector,
     colliders: tuple[Collider, ...] = (),
 ) -> SubstepRule:
-    """The rule for a simulation that begins with these particles (host): `config.substeps`, or else what is stable.
+    """The rule for a simulation that begins with these particles (host): `config.substeps`, or the fewest stable ones.
 
     The arguments are those of `choose_substeps`. In a domain without walls within reach (`vast_grid`) only time bounds
     how far matter falls, and few scenes fall for all of it. There a simulation begins with the substeps of a fall
@@ -204,8 +222,8 @@ def frame_substeps(
     """Substeps of one frame, numbered from 0, by the speeds at its beginning (host).
 
     It is `first`, or where that is too few the next of `first` times 1.5, 2, 3, 4, 6, ..., so that a long fall costs
-    few compilations. The state at the beginning of the frame decides alone: a simulation that goes on from there
-    chooses the same.
+    few compilations. It depends on the state at the beginning of the frame alone, so that a resumed simulation takes
+    the same number.
     """
     until = (frame + 1) * frame_dt
     needed = _substeps_needed(particles, grid, table, config, frame_dt, gravity, colliders, fall=frame_dt, until=until)
@@ -213,11 +231,22 @@ def frame_substeps(
     return next(-(-size // 2) for size in ladder if size >= 2 * needed)
 
 
-def _substeps_needed(particles, grid, table, config, frame_dt, gravity, colliders, *, fall, until):
-    """The fewest stable ones where matter may fall for a while [s] and colliders move until a time [s]."""
+def _substeps_needed(
+    particles: Particles,
+    grid: Grid,
+    table: MaterialTable,
+    config: SimConfig,
+    frame_dt: float,
+    gravity: Vector,
+    colliders: tuple[Collider, ...],
+    *,
+    fall: float,
+    until: float,
+) -> int:
+    """The fewest stable substeps where matter falls for at most `fall` [s] and colliders move until a time [s]."""
     pull = float(np.linalg.norm(gravity))
     height = float(grid.dx) * math.hypot(*grid.shape)
-    speed = _max_speed(particles, colliders, grid, until, way=lambda v: v * fall + pull * fall**2 / 2)
+    speed = _max_speed(particles, colliders, grid, until, displacement=lambda v: v * fall + pull * fall**2 / 2)
     speed = min(speed + pull * fall, math.sqrt(speed**2 + 2 * pull * height))
     limit = float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl, integrator=config.integrator))
     needed = frame_dt / limit * (1 - 1e-6) if limit > 0 else math.inf
@@ -229,41 +258,50 @@ def _substeps_needed(particles, grid, table, config, frame_dt, gravity, collider
     return math.ceil(needed)
 
 
-def is_open(grid):
+def is_open(grid: Grid) -> bool:
     """Whether the grid is so large that its walls are out of reach."""
     return math.prod(grid.shape) > LARGEST
 
 
-def _near(particles, grid):
-    """The grid around the particles where they are; the given one if no particle is finite."""
+def _near(particles: Particles, grid: Grid) -> Grid:
+    """The grid around the present positions of the particles; the given one if no particle is finite."""
     x = np.asarray(particles.x)
     return fit_grid(x, float(grid.dx)) if np.isfinite(x).all(1).any() else grid
 
 
-def _max_speed(particles, colliders, grid, until, way):
-    """Of particles now and of colliders until a time [s]; `way` tells how far matter gets [m] by its speed [m/s]."""
+def _max_speed(
+    particles: Particles,
+    colliders: tuple[Collider, ...],
+    grid: Grid,
+    until: float,
+    displacement: Callable[[float], float],
+) -> float:
+    """The largest speed [m/s] of particles now, and of colliders until a time [s].
+
+    `displacement` bounds how far matter gets [m] by its speed [m/s].
+    """
     fastest = float(_fastest(particles.v))
     moving = [collider for collider in colliders if collider.moves]
     if not moving:
         return fastest
     near, units = (_near(particles, grid) if is_open(grid) else grid), np.array(list(np.ndindex(2, 2, 2)))
     corners = np.asarray(near.origin) + float(near.dx) * units * (np.array(near.shape) - 1)
-    for _ in range(2 if is_open(grid) else 1):  # what a collider hits goes on as fast, and so gets farther
-        reached = corners + (2 * units - 1) * (way(fastest) if is_open(grid) else 0.0)
+    for _ in range(2 if is_open(grid) else 1):  # matter that a collider hits goes on as fast, and so gets farther
+        reached = corners + (2 * units - 1) * (displacement(fastest) if is_open(grid) else 0.0)
         points = jnp.asarray(reached, particles.x.dtype)
         fastest = max([fastest, *(float(collider.top_speed(points, until)) for collider in moving)])
     return fastest
 
 
 @jax.jit
-def _fastest(v):
-    """Speed of the fastest particle whose speed is finite; the square of a large one would not be."""
+def _fastest(v: Float[Array, "p 3"]) -> Float[Array, ""]:
+    """Speed of the fastest particle whose speed is finite, without squares, which would overflow."""
     speeds = jnp.hypot(jnp.hypot(v[:, 0], v[:, 1]), v[:, 2])
     return jnp.max(speeds, where=jnp.isfinite(speeds), initial=0.0)
 
 
 def check_steps(frames: Any, frame_dt: Any, gravity: Any) -> None:
-    """Refuse a number of frames, a time between them [s] or a gravity [m/s²] that no rollout takes (InputError)."""
+    """Raise an InputError for a number of frames, a frame_dt [s] or a gravity [m/s²] that no rollout takes."""
     if isinstance(frames, bool) or not isinstance(frames, int | np.integer) or frames < 1:
         raise InputError(f"frames = {frames}: must be a whole number, 1 or more.")
     check_gravity(gravity)
@@ -275,7 +313,7 @@ def check_steps(frames: Any, frame_dt: Any, gravity: Any) -> None:
 
 
 def check_gravity(gravity: Any) -> None:
-    """Refuse a gravity that has not three finite components [m/s²] (InputError)."""
+    """Raise an InputError for a gravity without three finite components [m/s²]."""
     if np.shape(gravity) != (3,):
         raise InputError(f"gravity has shape {np.shape(gravity)}: it must have three components [m/s²].")
     if not is_known(gravity):
@@ -284,9 +322,16 @@ def check_gravity(gravity: Any) -> None:
         raise InputError(f"gravity = {gravity}: its components must be finite [m/s²].")
 
 
-def longest_step(dt, particles, grid, table, config, colliders):
-    """The stable limit [s], with room for rounding, and the speed that it holds for [m/s]."""
-    speed = _max_speed(particles, colliders, grid, dt, way=lambda v: v * dt)
+def longest_step(
+    dt: float,
+    particles: Particles,
+    grid: Grid,
+    table: MaterialTable,
+    config: SimConfig,
+    colliders: tuple[Collider, ...],
+) -> tuple[float, float]:
+    """The stable limit [s], with room for rounding, and the largest speed [m/s], for which it holds."""
+    speed = _max_speed(particles, colliders, grid, dt, displacement=lambda v: v * dt)
     limit = float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl, integrator=config.integrator))
     return limit * (1 + 1e-5), speed
 
@@ -299,7 +344,7 @@ def check_dt(
     config: SimConfig,
     colliders: tuple[Collider, ...],
 ) -> None:
-    """Refuse a step [s] above the stable limit, unless `config.force` (InputError)."""
+    """Raise an InputError for a step [s] above the stable limit, unless `config.force`."""
     limit, speed = longest_step(dt, particles, grid, table, config, colliders)
     if dt > limit and not config.force:
         raise InputError(

@@ -45,7 +45,7 @@ def run_scene(
 
     Into `out_dir` go `video.mp4`, `contact_sheet.png`, `objects.png` (the objects in their colours), `labels.npz`,
     `states/<frame>.npz` (x, v and F_visual of every particle) and `report.json`. A run that was killed goes on from its
-    last state; when all states are there, only the video is drawn anew.
+    last state; when all states are there, only the video is redrawn.
 
     Args:
         scene: as `load_scene` gives it.
@@ -142,10 +142,9 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
 def _simulate(
     scene: Scene, plan: Plan, folder: Path, parts: dict[str, str], key: str, report: RunReport, tell: Progress
 ) -> None:
-    """Simulate what is not on disk yet, one rollout per frame on a grid that is fitted to its matter.
+    """Simulate the frames that are not on disk yet, from the last checkpoint on.
 
-    Goes on from the last checkpoint. States that are missing before it are made again from the start, with the same
-    bits.
+    States that are missing before it are simulated again from the start, with the same bits.
     """
     frames, particles = scene.simulation.frames, plan.particles
     present = io.readable_states(folder, signature=key)

@@ -251,15 +251,15 @@ def experiment(
     """Read a scene and make an experiment of it. Host.
 
     The substeps are those of the most demanding of `extremes`, and the grid holds the motion of the scene as it is and
-    of each of them. What goes further meets the domain's wall, counted in `Health.wall_hits`, and what is faster the
-    edge of the box of the grid that moves with matter (`SimConfig.box`), counted in `Health.escaped`.
+    of each of them. Matter that goes further meets the domain's wall, counted in `Health.wall_hits`; faster matter
+    meets the edge of the grid window that moves with it (`SimConfig.box`), counted in `Health.escaped`.
 
     Args:
         scene: as `load_scene` gives it.
         extremes: parameters at the ends of a study, as `Experiment.with_parameters` takes them; materials that cannot
             be are passed over.
         regions: number of parts that an object is split into, by place, so that its numbers may differ from part to
-            part; rows of the table, which cost nothing more.
+            part; they are rows of the table, without further cost.
         margin: room around the motion [m].
         alone: leave out the Gaussians of objects that the scene does not name; otherwise they are drawn as they stand.
 
@@ -281,7 +281,7 @@ def experiment(
 
 
 def _only_named(inputs: Inputs, plan: Plan) -> tuple[Inputs, Plan]:
-    """Without the Gaussians of other objects; the rest is renumbered."""
+    """Inputs and plan without the Gaussians of other objects, the remaining ones renumbered."""
     object_id = np.asarray(plan.labels.object_id)
     kept = np.isin(object_id, [0, *inputs.ids.values()])
     row = jnp.asarray(np.cumsum(kept) - 1)

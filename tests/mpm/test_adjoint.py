@@ -112,8 +112,8 @@ def test_derivatives_survive_vmap(x64):
     jax.tree.map(lambda all, *each: np.testing.assert_allclose(all, np.stack(each), rtol=1e-12), together, *apart)
 
 
-@pytest.mark.parametrize(("keep", "wide", "anew"), [(True, 0, 4), (False, 0, 10), (True, 1, 10)])
-def test_what_is_kept_is_not_computed_anew(x64, keep, wide, anew):
+@pytest.mark.parametrize(("keep", "wide", "recomputed"), [(True, 0, 4), (False, 0, 10), (True, 1, 10)])
+def test_kept_states_are_not_recomputed(x64, keep, wide, recomputed):
     """Ten steps in blocks of 4, the first of 2: all, or of each block all but its beginning, and of the last none."""
     seen = []
 
@@ -127,7 +127,7 @@ def test_what_is_kept_is_not_computed_anew(x64, keep, wide, anew):
     gradients(lambda *a: run_steps(own, *a, first), shared, state)
     jax.effects_barrier()
     linearized = 10  # once for each derivative of a step
-    assert len(seen) == 10 + anew + linearized
+    assert len(seen) == 10 + recomputed + linearized
 
 
 def test_only_what_is_asked_for_is_differentiated(x64):

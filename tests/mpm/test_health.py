@@ -58,6 +58,17 @@ def test_what_is_listed_is_what_is_bad_and_what_raises(counts, courant):
         health.raise_if_bad()
 
 
+def test_counts_add_up_among_groups_and_are_the_most_at_one_time_among_steps():
+    one, two = (
+        health_of(max_courant=0.1, escaped=2, unconverged=1),
+        health_of(max_courant=0.3, escaped=3, unconverged=1),
+    )
+    steps, groups = one.combine(two), one.combine(two, counts=jnp.add)
+    assert (int(steps.escaped), int(groups.escaped)) == (3, 5)
+    assert int(steps.unconverged) == int(groups.unconverged) == 2
+    assert float(steps.max_courant) == float(groups.max_courant) == pytest.approx(0.3)
+
+
 def test_bad_members_of_a_batch_are_named():
     bad = {1: {"escaped": 2, "first_bad_frame": 4}, 3: {"unconverged": 1, "first_bad_frame": 0}}
     batch = jax.tree.map(lambda *rows: jnp.stack(rows), *(health_of(**bad.get(k, {})) for k in range(5)))

@@ -535,11 +535,11 @@ def nothing_moves():
 
 
 SILENT_ONCE = {
-    "a NaN mass stops all other particles (frames.py: unit_mass)": one_bad_mass,
-    "a NaN volume of the first particle ends all (frames.py: go)": bad_volume_of_the_first,
+    "a NaN mass stops all other particles (program.py: unit_mass)": one_bad_mass,
+    "a NaN volume of the first particle ends all (program.py: opaque_true)": bad_volume_of_the_first,
     "min_J and max_courant are NaN once a particle is (substep.py: _check)": numbers_of_health,
     "float32 rounds away slow motion in stiff matter (substep.py: cells + dt/dx v)": slow_matter,
-    "the square of a speed of 1e30 m/s overflows unseen (mls_mpm.py: _max_speed)": one_of_huge_speed,
+    "the square of a speed of 1e30 m/s overflows unseen (timestep.py: _max_speed)": one_of_huge_speed,
     "only stationary matter (substep.py: particles_to_grid)": nothing_moves,
     "frame_dt < 0 (mls_mpm.py)": partial(refused, frame_dt=-1e-2),
     "frame_dt NaN (mls_mpm.py)": partial(refused, frame_dt=float("nan")),

@@ -1,4 +1,4 @@
-"""Rigid bodies that matter meets: a signed distance, a way to touch, and perhaps a pose and a prescribed motion.
+"""Colliders: rigid bodies with a signed distance, a contact mode, and perhaps a pose and a prescribed motion.
 
 To add one: subclass `Collider` and write its `shape_distance` and `ball`; normals follow by differentiation.
 """

@@ -1,4 +1,8 @@
-"""What all colliders share: pose and motion, contact by mode, and checks of their numbers."""
+"""The base of all colliders: pose and motion, contact by mode, and checks of their numbers.
+
+In explicit steps contact projects node velocities (`Collider.apply`), at once or over the width `softness`. In implicit
+steps colliders are compliant (penalty) constraints, as stiff as the matter (`implicit.newton`).
+"""
 
 from __future__ import annotations
 
@@ -32,18 +36,18 @@ def number(**kwargs: Any) -> Any:
 
 
 class Contact(NamedTuple):
-    """A collider as the grid sees it."""
+    """Contact of a collider with points, such as the nodes of the grid."""
 
-    inside: Bool[Array, "*n"] | Float[Array, "*n"]  # or the share of a soft contact
+    inside: Bool[Array, "*n"] | Float[Array, "*n"]  # a share from 0 to 1 where contact is soft
     normal: Float[Array, "*n 3"]
     velocity: Float[Array, "*#n 3"] | None = None  # of the collider's matter at the points [m/s]; None: at rest
 
 
 class Press(NamedTuple):
-    """How nodes press against a collider, where that is known beforehand."""
+    """How nodes press against a collider, where an earlier solve has found it."""
 
-    speed: Float[Array, "*n 1"]  # [m/s]: friction takes at most its coefficient times this from what glides
-    secant: bool = False  # whether friction has the derivative of a drag of the strength that it happens to have
+    speed: Float[Array, "*n 1"]  # [m/s]: friction takes at most its coefficient times this from the gliding speed
+    secant: bool = False  # whether the derivative of friction is that of a drag of its present strength
 
 
 class Collider(eqx.Module):
@@ -51,11 +55,11 @@ class Collider(eqx.Module):
 
     Modes: "sticky" holds matter, "slip" lets it glide but not leave, "separate" lets it glide with Coulomb friction and
     leave. At the start of a rollout the shape stands turned by `rotation` about `pivot`; from there it moves with
-    `velocity` and turns with `angular_velocity` about the pivot, which moves along. All may be differentiated. What is
-    None is not traced.
+    `velocity` and turns with `angular_velocity` about the pivot, which moves along. All may be differentiated. Fields
+    that are None are not traced.
 
     Whether a point is inside is a hard test, which has no derivative: a rollout can be differentiated by friction, by
-    velocities and, through the normals, by the pose, but a plane shifted along its normal changes nothing until it
+    velocities and, through the normals, by the pose, but a plane shifted along its normal has no effect until it
     passes a node. With a `softness`, contact sets in smoothly over that width, and so all of the pose counts.
 
     Raises:
@@ -71,7 +75,7 @@ class Collider(eqx.Module):
     softness: Scalar | None = number(default=None, kw_only=True)  # width over which contact sets in [m]; None: hard
     mode: str = static_field(default="separate", kw_only=True)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         if not isinstance(self.mode, str) or self.mode not in MODES:
             raise InputError(f"mode = {shown(self.mode)}: choose one of {', '.join(MODES)}.")
         for field in dataclasses.fields(self):
@@ -93,7 +97,7 @@ class Collider(eqx.Module):
             raise InputError(f"{name} = {shown}: {rule}.")
 
     def _check_types(self) -> None:
-        """Whether every number is one, and every vector has its length: what the rules of subclasses stand on."""
+        """Whether every number is one, and every vector has its length, as the rules of subclasses assume."""
         for field in dataclasses.fields(self):
             value, kind = getattr(self, field.name), str(field.type)
             traced = isinstance(value, jax.core.Tracer)
@@ -150,12 +154,12 @@ class Collider(eqx.Module):
             return speed
         middle, radius = self.ball()
         reach = safe_norm(middle - self._pivot) + radius
-        # the way from a pivot that moves straight is convex in time: the longest is at the start or at the end
+        # the distance from a pivot that moves straight is convex in time: the largest is at the start or at the end
         longest = [safe_norm(points - self._pivot_at(time)).max() for time in (0.0, duration)]
         return speed + safe_norm(self.angular_velocity) * jnp.minimum(reach, jnp.maximum(*longest))
 
     def apply(self, contact: Contact, velocity: Points, press: Press | None = None) -> Points:
-        """Velocities of grid nodes [m/s] after they met it, with friction by how they did so or as `press` says."""
+        """Velocities of grid nodes [m/s] after contact, with friction by their normal velocity or by `press`."""
         own = 0.0 if contact.velocity is None else contact.velocity
         touched = own + self._allowed(velocity - own, contact.normal, press)
         inside = contact.inside[..., None]
@@ -163,7 +167,8 @@ class Collider(eqx.Module):
             return jnp.where(inside, touched, velocity)
         return velocity + inside * (touched - velocity)
 
-    def _allowed(self, relative, normal, press):
+    def _allowed(self, relative: Points, normal: Points, press: Press | None) -> Points:
+        """Velocities relative to the collider [m/s] that its mode leaves of others."""
         if self.mode == "sticky":
             return jnp.zeros_like(relative)
         speed = (relative * normal).sum(-1, keepdims=True)
@@ -177,23 +182,23 @@ class Collider(eqx.Module):
             drag = lax.stop_gradient(drag) if press.secant else drag
             return (1 - drag) * tangential + jnp.maximum(speed, 0.0) * normal
         # Coulomb: the tangential impulse is at most the friction coefficient times the normal one, which is -speed.
-        # What is too slow to glide is not divided by: the slope at next to no glide would be infinite times nothing.
+        # No division by speeds too slow to glide: the slope at almost no glide would be infinity times zero.
         glides = (speed < 0) & (glide >= -self.friction * speed)
         kept = jnp.where(glides, 1 + self.friction * speed / jnp.where(glides & (glide > 0), glide, 1.0), 0.0)
         return jnp.where(speed < 0, kept * tangential, relative)
 
-    def _distance_and_normals(self, points, time):
+    def _distance_and_normals(self, points: Points, time: Time) -> tuple[Float[Array, "*n"], Points]:
         distance, pull = jax.vjp(lambda p: self.distance(p, time), points)
         return distance, safe_normalize(pull(jnp.ones_like(distance))[0])
 
     @property
-    def _pivot(self):
+    def _pivot(self) -> Float[Array, "3"]:
         return self.ball()[0] if self.pivot is None else self.pivot
 
-    def _pivot_at(self, time):
+    def _pivot_at(self, time: Time) -> Float[Array, "3"]:
         return self._pivot if self.velocity is None else self._pivot + self.velocity * (self.elapsed + time)
 
-    def _to_shape(self, points, time):
+    def _to_shape(self, points: Points, time: Time) -> Points:
         """The same points of the body where the shape's own numbers describe it."""
         turn = self.rotation
         if self.angular_velocity is not None:
@@ -204,7 +209,7 @@ class Collider(eqx.Module):
             return self._pivot + (from_pivot[..., :, None] * quat_to_matrix(turn)).sum(-2)
         return points if self.velocity is None else points - self.velocity * (self.elapsed + time)
 
-    def _own_velocity(self, points, time):
+    def _own_velocity(self, points: Points, time: Time) -> Float[Array, "*#n 3"] | None:
         if self.angular_velocity is None:
             return self.velocity
         spin = jnp.cross(self.angular_velocity, points - self._pivot_at(time))
@@ -216,7 +221,7 @@ def has_direction(vector: np.ndarray) -> Any:
     return np.square(vector, dtype=np.float64).sum(-1) > 1e-37
 
 
-def _quat_of_spin(vector):
+def _quat_of_spin(vector: Float[Array, "3"]) -> Float[Array, "4"]:
     """Unit quaternion that turns about a vector by its length [rad]."""
     angle = safe_norm(vector)
     return jnp.concatenate([jnp.cos(angle / 2)[None], vector * jnp.sinc(angle / (2 * np.pi)) / 2])

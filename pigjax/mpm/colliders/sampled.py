@@ -23,12 +23,12 @@ class SampledDistance(Collider):
     origin: Float[Array, "3"] = number()  # of sample 0, 0, 0 [m]
     dx: Scalar = number()  # [m]
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         self.require("dx", "the spacing of samples must be > 0 m", lambda dx: ~(dx <= 0))
         self.require("samples", "two or more are needed along every axis", lambda v: min(v.shape[-3:]) >= 2)
 
     def shape_distance(self, points: Points) -> Float[Array, "*n"]:
-        """By trilinear interpolation; beyond the lattice, at least the way to it."""
+        """By trilinear interpolation; beyond the lattice, at least the distance to it."""
         cells = (points - self.origin) / self.dx
         last = jnp.asarray(self.samples.shape) - 1
         low = jnp.clip(jnp.floor(lax.stop_gradient(cells)).astype(int), 0, last - 1)

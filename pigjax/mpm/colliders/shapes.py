@@ -15,7 +15,7 @@ class Plane(Collider):
     point: Float[Array, "3"] = number()  # on the plane [m]
     normal: Float[Array, "3"] = number()  # out of the solid side, any length
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         self.require("normal", "it must not be zero", has_direction)
 
     def shape_distance(self, points: Points) -> Float[Array, "*n"]:
@@ -33,7 +33,7 @@ class Sphere(Collider):
     centre: Float[Array, "3"] = number()  # [m]
     radius: Scalar = number()  # [m]
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         self.require("radius", "it must be > 0 m", lambda radius: ~(radius <= 0))
 
     def shape_distance(self, points: Points) -> Float[Array, "*n"]:
@@ -51,7 +51,7 @@ class Box(Collider):
     lower: Float[Array, "3"] = number()  # [m]
     upper: Float[Array, "3"] = number()  # [m]
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         self.require("upper", "it must be above lower along every axis", lambda upper: ~(upper <= self.lower))
 
     def shape_distance(self, points: Points) -> Float[Array, "*n"]:
@@ -64,26 +64,26 @@ class Box(Collider):
 
 
 class _Round(Collider):
-    """What is round about the axis between two points."""
+    """Base of shapes of revolution about the axis between two points."""
 
     start: Float[Array, "3"] = number()  # of the axis [m]
     end: Float[Array, "3"] = number()  # of the axis [m]
     radius: Scalar = number()  # [m]
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         self.require("radius", "it must be > 0 m", lambda radius: ~(radius <= 0))
 
-    def _around_axis(self, points):
+    def _around_axis(self, points: Points) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
         """Distance of points from the axis [m], and how far they are beyond the nearer end along it [m]."""
         axis, middle, half = self._axis()
         offset = points - middle
         along = (offset * axis).sum(-1)
         return safe_norm(offset - along[..., None] * axis), jnp.abs(along) - half
 
-    def _axis(self):
+    def _axis(self) -> tuple[Float[Array, "3"], Float[Array, "3"], Scalar]:
         """Direction, middle [m] and half length [m]."""
-        way = self.end - self.start
-        return safe_normalize(way), (self.start + self.end) / 2, safe_norm(way) / 2
+        along = self.end - self.start
+        return safe_normalize(along), (self.start + self.end) / 2, safe_norm(along) / 2
 
 
 class Capsule(_Round):
@@ -109,7 +109,7 @@ class Cylinder(_Round):
     Raises InputError where the radius is not > 0 or the ends coincide.
     """
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         self.require("end", "it must differ from start", lambda end: (end != self.start).any(-1))
 
     def shape_distance(self, points: Points) -> Float[Array, "*n"]:
@@ -123,6 +123,6 @@ class Cylinder(_Round):
         return middle, safe_norm(jnp.stack([half, self.radius]))
 
 
-def _from_walls(beyond):
+def _from_walls(beyond: Float[Array, "*n k"]) -> Float[Array, "*n"]:
     """Signed distance where walls meet at right angles, from that of each pair [m]."""
     return safe_norm(jnp.maximum(beyond, 0.0)) + jnp.minimum(beyond.max(-1), 0.0)

@@ -1,4 +1,4 @@
-"""Constitutive laws of the matter: what a user names (`Material`, `preset`), and what a simulation traces (`LAWS`)."""
+"""Constitutive laws: materials as users state them (`Material`, `preset`), and the functions of each law (`LAWS`)."""
 
 from pigjax.mpm.materials.laws import LAWS, Law, Response, respond
 from pigjax.mpm.materials.presets import PRESETS, preset

@@ -8,9 +8,11 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
 from pigjax.core import linalg
 from pigjax.core.arrays import everywhere
+from pigjax.mpm.materials.parameters import Parameters
 from pigjax.mpm.materials.tensors import (
     Scalars,
     Tensors,
@@ -28,7 +30,7 @@ _ILL_CONDITIONED = 0.05  # of (s₁+s₂)(s₂+s₃)(s₃+s₁) / (s₁+s₂+s�
 _SMALLEST_STRETCH = 0.01  # floor of J and of principal stretches under a logarithm: stiff, and finite when inverted
 
 
-def fixed_corotated(F: Tensors, m) -> Tensors:
+def fixed_corotated(F: Tensors, m: Parameters) -> Tensors:
     """τ = 2μ (b − V) + λ J (J − 1) I with b = F Fᵀ and V = R Fᵀ (Stomakhin et al. 2012, doi 10.2312/SCA/SCA12/025-032).
 
     Ψ = μ ‖F − R‖² + λ/2 (J − 1)². Stays finite through inversion.
@@ -38,7 +40,7 @@ def fixed_corotated(F: Tensors, m) -> Tensors:
     return 2 * m.mu * (b - left_stretch(F, b, J)) + m.lam * J * (J - 1) * identity(F)
 
 
-def neo_hookean(F: Tensors, m) -> Tensors:
+def neo_hookean(F: Tensors, m: Parameters) -> Tensors:
     """τ = μ (F Fᵀ − I) + λ log J I (Bonet and Wood 2008, eq. 6.28); J is floored at 0.01, see `_orientation`.
 
     Ψ = μ/2 (tr FᵀF − 3) − μ log J + λ/2 log² J.
@@ -48,7 +50,7 @@ def neo_hookean(F: Tensors, m) -> Tensors:
     return m.mu * product(F, transpose(F)) + barrier * _orientation(J) * identity(F)
 
 
-def stvk_hencky(F: Tensors, m) -> Tensors:
+def stvk_hencky(F: Tensors, m: Parameters) -> Tensors:
     """τ = U (2μ ε + λ tr ε I) Uᵀ with ε = log Σ, St. Venant–Kirchhoff in Hencky strain (Klar et al. 2016, sec. 6.1).
 
     Ψ = μ ‖ε‖² + λ/2 tr²ε. Needs the singular value decomposition F = U Σ Vᵀ. Stretches are floored at 0.01, see
@@ -59,20 +61,20 @@ def stvk_hencky(F: Tensors, m) -> Tensors:
 
 
 def _orientation(measure: Scalars) -> Scalars:
-    """1 for matter right side out, 0 where it is flat, −1 where it is inside out by more than the floor of logarithms.
+    """1 for matter that is not inverted, 0 where it is flat, −1 where it is inverted by more than the floor.
 
-    What is inside out pulls itself together. Were its pressure kept, it would push its surroundings apart without end,
-    since F grows and shrinks by factors and turns no more.
+    Inverted matter then pulls itself together. With the pressure of the law it would push its surroundings apart
+    without end, since F only grows and shrinks by factors and cannot turn back.
     """
     return jnp.where(measure > 0, 1.0, jnp.maximum(measure / _SMALLEST_STRETCH, -1.0))
 
 
-def hencky_strain(stretches):
+def hencky_strain(stretches: Float[Array, "3 *n"]) -> Float[Array, "3 *n"]:
     """Logarithms of principal stretches [3 *n], floored at 0.01."""
     return jnp.log(jnp.maximum(stretches, _SMALLEST_STRETCH))
 
 
-def hencky_stress(strain, m):
+def hencky_stress(strain: Float[Array, "3 *n"], m: Parameters) -> Float[Array, "3 *n"]:
     """Principal Kirchhoff stresses of principal Hencky strains, both [3 *n]."""
     return 2 * m.mu * strain + m.lam * strain.sum(0)
 
@@ -119,6 +121,6 @@ def _first_invariant(b: Tensors, J: Scalars) -> Scalars:
             y = newton(y, *fixed)
         return y
 
-    # A loop, where what is unrolled would be computed anew by XLA for each of its many uses; of few rounds, which cost.
+    # A loop, since XLA would recompute unrolled iterations for each of their many uses; of few rounds, which cost.
     y = lax.fori_loop(0, 2, half_of_them, jnp.sqrt(3 * fixed[0]))
     return newton(newton(y, *coefficients), *coefficients)

@@ -6,16 +6,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pigjax.mpm.materials.elastic import neo_hookean
+from pigjax.mpm.materials.parameters import Parameters
 from pigjax.mpm.materials.tensors import Tensors
 
 
-def fibre_direction(m) -> Float[Array, "3 *n"]:
+def fibre_direction(m: Parameters) -> Float[Array, "3 *n"]:
     """Unit vector of the fibres at rest: azimuth about z from x, and elevation above the plane of x and y [rad]."""
     flat = jnp.cos(m.fibre_elevation)
     return jnp.stack([flat * jnp.cos(m.fibre_azimuth), flat * jnp.sin(m.fibre_azimuth), jnp.sin(m.fibre_elevation)])
 
 
-def fibre_reinforced(F: Tensors, m) -> Tensors:
+def fibre_reinforced(F: Tensors, m: Parameters) -> Tensors:
     """τ = neo-Hookean + E_f/2 ⟨I₄ − 1⟩ a aᵀ with a = F a₀ and I₄ = a·a; fibres are slack where they are shorter than 1.
 
     Ψ = neo-Hookean + E_f/8 ⟨I₄ − 1⟩², the limit of small exponents of Holzapfel et al. 2000

@@ -10,14 +10,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from pigjax.mpm.materials.tensors import Scalars, length
+from pigjax.mpm.materials.parameters import Parameters
+from pigjax.mpm.materials.tensors import Scalar, Scalars, length
 
 Strains = Float[Array, "3 *n"]
 
 _NEWTON_STEPS = 7  # from above: six leave 4e-16 for flow exponents of 0.1 to 10
 
 
-def herschel_bulkley(strain: Strains, dt, m) -> Strains:
+def herschel_bulkley(strain: Strains, dt: Scalar, m: Parameters) -> Strains:
     """Principal strains [3 *n] after dt [s] of flow at the rate ((s − s_y) / η)^(1/h) of shear, from the trial ones.
 
     In lasting shear s = s_y + η γ̇^h, with s the shear stress ‖dev τ‖/√2 [Pa], γ̇ the rate of engineering shear [1/s],
@@ -34,7 +35,7 @@ def herschel_bulkley(strain: Strains, dt, m) -> Strains:
     return mean + deviatoric * kept
 
 
-def _relaxed(excess: Scalars, impulse, m) -> Scalars:
+def _relaxed(excess: Scalars, impulse: Array, m: Parameters) -> Scalars:
     """Root x of x + impulse (x/η)^(1/h) = excess, where excess > 0 and impulse = μ dt > 0.
 
     In x where flow thins (h <= 1), in the shear impulse (x/η)^(1/h) where it thickens, the equation is the convex one

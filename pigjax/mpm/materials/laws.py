@@ -1,20 +1,21 @@
-"""The laws by name, all with one face: one step of a particle's elastic state, and the stress after it.
+"""The laws by name, all with one signature: one step of a particle's elastic state, and the stress after it.
 
-To add a law: write its stress or return map in the module of its kind, wrap it here with what the stages must know of
-it, and test its stress or return point against a closed form.
+To add a law: write its stress or return map in the module of its kind, wrap it here as a `Law`, and test its stress or
+return point against a closed form.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pigjax.core.errors import InputError
 from pigjax.mpm.materials import elastic, fibres, fluid, foam, plastic, plasticine, snow
-from pigjax.mpm.materials.tensors import Scalars, Tensors, determinant, identity, product, spectral, svd
+from pigjax.mpm.materials.parameters import Parameters
+from pigjax.mpm.materials.tensors import Scalar, Scalars, Tensors, determinant, identity, product, spectral, svd
 
 
 class Response(NamedTuple):
@@ -26,20 +27,25 @@ class Response(NamedTuple):
 
 
 class Law(NamedTuple):
-    """A constitutive law: `respond(F, rate, dt, hardening, m)`, and what the stages around it must know of it."""
+    """A constitutive law: `respond(F, rate, dt, hardening, m)`, and its properties that the steps need."""
 
     respond: Callable[..., Response] | None  # None: matter that never moves
     needs: tuple[str, ...]  # material parameters that must be given
     total: bool  # whether F is the total deformation, so that F_visual is F
     hardens: bool  # whether the law has an internal variable, which is 0 at first
-    modulus: Callable[..., Scalars]  # of `Parameters`: the most that pressure waves meet at small stretches [Pa]
+    modulus: Callable[..., Scalars]  # of `Parameters`: largest modulus of pressure waves at small stretches [Pa]
 
 
-def respond(model: str, F: Tensors, rate: Tensors, dt, hardening: Scalars | None, m) -> Response:
-    """One step of law `model` from F with the velocity gradient `rate` [1/s] over dt [s].
+def respond(model: str, F: Tensors, rate: Tensors, dt: Scalar, hardening: Scalars | None, m: Parameters) -> Response:
+    """One step of a law: the elastic state after dt, and its Kirchhoff stress.
 
-    `m` is a `MaterialTable` with one row for each particle, or a single row. With dt = 0 it is the stress of F itself.
-    The internal variable `hardening` may be None where the law has none (`Law.hardens`).
+    Args:
+        model: name of the law, a key of `LAWS`.
+        F: elastic deformation gradients at the beginning of the step.
+        rate: velocity gradients [1/s].
+        dt: duration [s]; 0 for the stress of F itself, which plastic laws return to their yield surface.
+        hardening: internal variable; may be None where the law has none (`Law.hardens`).
+        m: parameters of one material, or of the material of each particle.
 
     Raises:
         InputError: the model is unknown or does not move.
@@ -54,18 +60,26 @@ def law_of(model: str) -> Law:
     """The law of that name.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no law of that name.
     """
     if model not in LAWS:
         raise InputError(f"Material model {model!r} is unknown: choose one of {', '.join(sorted(LAWS))}.")
     return LAWS[model]
 
 
-def _pressure_modulus(m) -> Scalars:
+Modulus: TypeAlias = Callable[..., Scalars]
+Flow: TypeAlias = Callable[..., tuple]
+
+
+def _pressure_modulus(m: Parameters) -> Scalars:
     return m.lam + 2 * m.mu
 
 
-def _elastic(stress, *, needs=(), modulus=_pressure_modulus) -> Law:
+def _elastic(
+    stress: Callable[..., Tensors], *, needs: tuple[str, ...] = (), modulus: Modulus = _pressure_modulus
+) -> Law:
+    """A hyperelastic law of `stress(F, m) -> τ`."""
+
     def step(F, rate, dt, hardening, m):
         F = F + dt * product(rate, F)
         return Response(F, hardening, stress(F, m))
@@ -73,7 +87,7 @@ def _elastic(stress, *, needs=(), modulus=_pressure_modulus) -> Law:
     return Law(step, ("young", "poisson", *needs), total=True, hardens=False, modulus=modulus)
 
 
-def _plastic(flow, *, needs, hardens=True, modulus=_pressure_modulus) -> Law:
+def _plastic(flow: Flow, *, needs: tuple[str, ...], hardens: bool = True, modulus: Modulus = _pressure_modulus) -> Law:
     """A law of `flow(trial stretches, hardening, dt, m) -> (stretches, hardening, principal stresses)`."""
 
     def step(F, rate, dt, hardening, m):
@@ -84,7 +98,9 @@ def _plastic(flow, *, needs, hardens=True, modulus=_pressure_modulus) -> Law:
     return Law(step, ("young", "poisson", *needs), total=False, hardens=hardens, modulus=modulus)
 
 
-def _hencky(return_map, stress=lambda strain, hardening, m: elastic.hencky_stress(strain, m)):
+def _hencky(
+    return_map: Callable, stress: Callable = lambda strain, hardening, m: elastic.hencky_stress(strain, m)
+) -> Flow:
     """Flow of stretches by a return map of Hencky strains."""
 
     def flow(stretches, hardening, dt, m):
@@ -94,17 +110,21 @@ def _hencky(return_map, stress=lambda strain, hardening, m: elastic.hencky_stres
     return flow
 
 
-def _snow(stretches, hardening, dt, m):
+def _snow(
+    stretches: Float[Array, "3 *n"], hardening: Scalars, dt: Scalar, m: Parameters
+) -> tuple[Float[Array, "3 *n"], Scalars, Float[Array, "3 *n"]]:
     stretches, hardening = snow.crumble(stretches, hardening, m)
     return stretches, hardening, snow.stress(stretches, hardening, m)
 
 
-def _foam(stretches, hardening, dt, m):
+def _foam(
+    stretches: Float[Array, "3 *n"], hardening: Scalars | None, dt: Scalar, m: Parameters
+) -> tuple[Float[Array, "3 *n"], Scalars | None, Float[Array, "3 *n"]]:
     strain = foam.herschel_bulkley(elastic.hencky_strain(stretches), dt, m)
     return jnp.exp(strain), hardening, elastic.hencky_stress(strain, m)
 
 
-def _fluid(F, rate, dt, hardening, m):
+def _fluid(F: Tensors, rate: Tensors, dt: Scalar, hardening: Scalars | None, m: Parameters) -> Response:
     J = fluid.volume_ratio(determinant(F), rate, dt)
     return Response(jnp.cbrt(J) * identity(F), hardening, fluid.newtonian(J, rate, m))
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from pigjax.mpm.materials.parameters import Parameters
 from pigjax.mpm.materials.tensors import Scalars, length
 
 Strains = Float[Array, "3 *n"]
 
 
-def von_mises(strain: Strains, hardening: Scalars, m) -> tuple[Strains, Scalars]:
+def von_mises(strain: Strains, hardening: Scalars, m: Parameters) -> tuple[Strains, Scalars]:
     """Radial return to ‖dev τ‖ ≤ √(2/3) σ_y(α), with σ_y the uniaxial yield stress (Simo and Hughes 1998, box 3.1).
 
     σ_y(α) = max(yield_stress + hardening_modulus α, residual_stress), with α the equivalent plastic strain; a negative
@@ -30,7 +31,7 @@ def von_mises(strain: Strains, hardening: Scalars, m) -> tuple[Strains, Scalars]
     return shortened(strain, flow), hardening + root * flow
 
 
-def drucker_prager(strain: Strains, hardening: Scalars, m) -> tuple[Strains, Scalars]:
+def drucker_prager(strain: Strains, hardening: Scalars, m: Parameters) -> tuple[Strains, Scalars]:
     """Non-associated return to ‖dev τ‖ + α (tr τ − 3 c cot φ) ≤ 0 (Klar et al. 2016, doi 10.1145/2897824.2925906).
 
     α = √(2/3) 2 sin φ / (3 − sin φ) with φ the friction angle, c the cohesion [Pa]. Matter that pulls apart goes to the

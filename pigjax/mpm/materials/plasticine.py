@@ -9,28 +9,29 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from pigjax.mpm.materials.parameters import Parameters
 from pigjax.mpm.materials.plastic import shortened
 from pigjax.mpm.materials.tensors import Scalars, length
 
 Strains = Float[Array, "3 *n"]
 
 
-def return_map(strain: Strains, hardening: Scalars, m) -> tuple[Strains, Scalars]:
+def return_map(strain: Strains, hardening: Scalars, m: Parameters) -> tuple[Strains, Scalars]:
     """Radial return of principal strains [3 *n] to the undamaged yield stress; the equivalent plastic strain grows."""
     root = (2 / 3) ** 0.5
     flow = jnp.maximum(length(strain - strain.mean(0)) - root * m.yield_stress / (2 * m.mu), 0.0)
     return shortened(strain, flow), hardening + root * flow
 
 
-def damage(hardening: Scalars, m) -> Scalars:
+def damage(hardening: Scalars, m: Parameters) -> Scalars:
     """D = 1 − σ_y(α)/yield_stress with σ_y(α) = max(yield_stress + hardening_modulus α, residual_stress)."""
     return jnp.clip(-m.hardening_modulus * hardening / m.yield_stress, 0.0, 1 - m.residual_stress / m.yield_stress)
 
 
-def stress(strain: Strains, hardening: Scalars, m) -> Strains:
+def stress(strain: Strains, hardening: Scalars, m: Parameters) -> Strains:
     """Principal Kirchhoff stresses [Pa]: (1 − D) (2μ dev ε + K ⟨tr ε⟩₊) − K ⟨−tr ε⟩₊, with K the bulk modulus.
 
-    Within ‖dev τ‖ <= √(2/3) σ_y(α): softened to a residual of zero, matter bears pressure and nothing else.
+    Within ‖dev τ‖ <= √(2/3) σ_y(α): softened to a residual of zero, matter bears only pressure.
     """
     kept = 1 - damage(hardening, m)
     volumetric = strain.sum(0)

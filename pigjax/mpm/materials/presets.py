@@ -10,7 +10,7 @@ from pigjax.core.errors import InputError
 from pigjax.mpm.materials.table import Material
 
 # Densities, angles, yield stresses of soft matter and viscosities are those of the real matter. Moduli of stiff matter
-# (and the yield stress of metal) are lowered to what explicit steps afford: its waves are slower, its rest shapes and
+# (and the yield stress of metal) are lowered to suit explicit steps: its waves are slower, its rest shapes and
 # its flow look the same. Steel and stone keep their own moduli, whose explicit steps are about a microsecond on a grid
 # of a centimetre: they are for slow motion, or for the implicit integrator.
 PRESETS: dict[str, dict[str, Any]] = {
@@ -105,7 +105,7 @@ def preset(name: str) -> Material:
     """The material of that name, one of `PRESETS`.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no preset of that name.
     """
     if name not in PRESETS:
         raise InputError(f"Preset {name!r} is unknown: choose one of {', '.join(sorted(PRESETS))}.")

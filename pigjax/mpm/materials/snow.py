@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pigjax.mpm.materials.elastic import hencky_strain
+from pigjax.mpm.materials.parameters import Parameters
 from pigjax.mpm.materials.tensors import Scalars
 
 Stretches = Float[Array, "3 *n"]
@@ -15,10 +16,10 @@ Stretches = Float[Array, "3 *n"]
 _LARGEST_HARDENING = 10.0  # packed snow is this many times as stiff at most; steps stay stable up to there
 _LOOSEST = math.log(
     20.0
-)  # of log Jp that hardening reads: beyond, snow is powder without stress, and nothing overflows
+)  # bound of log Jp in the hardening factor: beyond, snow is powder without stress, and exp must not overflow
 
 
-def crumble(stretches: Stretches, hardening: Scalars, m) -> tuple[Stretches, Scalars]:
+def crumble(stretches: Stretches, hardening: Scalars, m: Parameters) -> tuple[Stretches, Scalars]:
     """Elastic stretches [3 *n] held in [1 − θ_c, 1 + θ_s], and log Jp after the plastic flow that takes the rest.
 
     Jp is the volume ratio of all plastic flow so far: log Jp starts at 0 and falls as snow is packed.
@@ -27,18 +28,18 @@ def crumble(stretches: Stretches, hardening: Scalars, m) -> tuple[Stretches, Sca
     return held, hardening + (hencky_strain(stretches) - jnp.log(held)).sum(0)
 
 
-def hardening_factor(hardening: Scalars, m) -> Scalars:
+def hardening_factor(hardening: Scalars, m: Parameters) -> Scalars:
     """exp(ξ (1 − Jp)), by which μ and λ grow, at most 10."""
     exponent = m.hardening_coefficient * (1 - jnp.exp(jnp.minimum(hardening, _LOOSEST)))
     return jnp.exp(jnp.minimum(exponent, math.log(_LARGEST_HARDENING)))
 
 
-def largest_hardening_factor(m) -> Scalars:
-    """What `hardening_factor` tends to as snow is packed without end."""
+def largest_hardening_factor(m: Parameters) -> Scalars:
+    """Limit of `hardening_factor` as snow is packed."""
     return jnp.exp(jnp.minimum(m.hardening_coefficient, math.log(_LARGEST_HARDENING)))
 
 
-def stress(stretches: Stretches, hardening: Scalars, m) -> Stretches:
+def stress(stretches: Stretches, hardening: Scalars, m: Parameters) -> Stretches:
     """Principal Kirchhoff stresses [Pa] of hardened fixed corotated elasticity, 2μ s (s − 1) + λ J (J − 1)."""
     J = stretches.prod(0)
     unhardened = 2 * m.mu * stretches * (stretches - 1) + m.lam * J * (J - 1)

@@ -6,59 +6,17 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import fields
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import as_real, static_field
+from pigjax.core.arrays import static_field
 from pigjax.core.checks import Limits, is_numeric, shown
 from pigjax.core.errors import InputError
 from pigjax.mpm.materials.laws import law_of
-
-
-def _number(**kwargs):
-    """A number that a user may sweep: always an array, so that a new value never recompiles."""
-    return eqx.field(converter=as_real, kw_only=True, **kwargs)
-
-
-class Parameters(eqx.Module):
-    """The numbers of materials in SI units. A law ignores those that it has no use for."""
-
-    density: Float[Array, "*m"] = _number()  # at rest [kg/m³]
-    young: Float[Array, "*m"] = _number(default=0.0)  # Young's modulus [Pa]
-    poisson: Float[Array, "*m"] = _number(default=0.0)  # Poisson's ratio
-    yield_stress: Float[Array, "*m"] = _number(default=0.0)  # uniaxial [Pa]
-    hardening_modulus: Float[Array, "*m"] = _number(default=0.0)  # rise of the yield stress by plastic strain [Pa]
-    residual_stress: Float[Array, "*m"] = _number(default=0.0)  # the yield stress softens no further [Pa]
-    friction_angle: Float[Array, "*m"] = _number(default=0.0)  # [rad]
-    cohesion: Float[Array, "*m"] = _number(default=0.0)  # [Pa]
-    bulk_modulus: Float[Array, "*m"] = _number(default=0.0)  # of a fluid; 0: from young and poisson [Pa]
-    viscosity: Float[Array, "*m"] = _number(default=0.0)  # dynamic [Pa s]; of a foam [Pa sʰ] with its exponent h
-    flow_exponent: Float[Array, "*m"] = _number(default=1.0)  # h of Herschel and Bulkley; 1 is Bingham's, < 1 thins
-    hardening_coefficient: Float[Array, "*m"] = _number(default=10.0)  # ξ of snow
-    critical_compression: Float[Array, "*m"] = _number(default=2.5e-2)  # strain at which snow is packed
-    critical_stretch: Float[Array, "*m"] = _number(default=7.5e-3)  # strain at which snow breaks
-    fibre_stiffness: Float[Array, "*m"] = _number(default=0.0)  # Young's modulus that fibres add along them [Pa]
-    fibre_azimuth: Float[Array, "*m"] = _number(default=0.0)  # of fibres at rest, about z from x [rad]
-    fibre_elevation: Float[Array, "*m"] = _number(default=0.0)  # of fibres at rest, above the plane of x and y [rad]
-
-    @property
-    def mu(self) -> Float[Array, "*m"]:
-        """Shear modulus μ = E / 2(1 + ν) [Pa]."""
-        return self.young / (2 * (1 + self.poisson))
-
-    @property
-    def lam(self) -> Float[Array, "*m"]:
-        """Lamé's first parameter λ = E ν / (1 + ν)(1 − 2ν) [Pa]."""
-        return self.young * self.poisson / ((1 + self.poisson) * (1 - 2 * self.poisson))
-
-    @property
-    def bulk(self) -> Float[Array, "*m"]:
-        """Bulk modulus [Pa]: as given, or λ + 2μ/3."""
-        return jnp.where(self.bulk_modulus > 0, self.bulk_modulus, self.lam + 2 / 3 * self.mu)
+from pigjax.mpm.materials.parameters import Parameters
 
 
 class Material(Parameters):
@@ -70,7 +28,7 @@ class Material(Parameters):
 
     model: str = static_field()  # one of `materials.LAWS`
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         if not isinstance(self.model, str):
             raise InputError(f"model = {shown(self.model)}: it must be the name of a law.")
         for number in fields(Parameters):
@@ -95,7 +53,7 @@ class Material(Parameters):
                 )
 
 
-# What each number is called, and its range where a law needs it or it is given.
+# The noun of each number, and its range where a law needs it or it is given.
 LIMITS: dict[str, tuple[str, Limits]] = {
     "density": ("the density", Limits(0, 1e9, above=True, unit="kg/m³")),
     "young": ("Young's modulus", Limits(0, above=True, unit="Pa")),
@@ -116,7 +74,7 @@ LIMITS: dict[str, tuple[str, Limits]] = {
     "fibre_azimuth": ("the azimuth of fibres", Limits(-1e6, 1e6, unit="rad")),
     "fibre_elevation": ("the elevation of fibres", Limits(-1e6, 1e6, unit="rad")),
 }
-# Laws, and what must hold between the numbers of one material.
+# Rules between the numbers of one material, by law.
 _JOINT_LIMITS = (
     (
         "hardening_modulus",

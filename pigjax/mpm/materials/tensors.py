@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from pigjax.core import linalg
 
 Tensors = Float[Array, "3 3 *n"]
 Scalars = Float[Array, "*n"]
+Scalar = Float[Array, ""] | float
 
 
 def identity(like: Tensors) -> Float[Array, "3 3 *_"]:
@@ -25,7 +28,7 @@ def product(a: Tensors, b: Tensors) -> Tensors:
 
 
 @product.defjvp
-def _product_jvp(primals, tangents):
+def _product_jvp(primals: Any, tangents: Any) -> tuple[Tensors, Tensors]:
     (a, b), (da, db) = primals, tangents
     # the transpose of a sum is a broadcast, where that of slices pads each of them to the whole and adds them up
     return product(a, b), (da[:, :, None] * b[None] + a[:, :, None] * db[None]).sum(1)
@@ -43,7 +46,7 @@ def trace(a: Tensors) -> Scalars:
 
 
 @trace.defjvp
-def _trace_jvp(primals, tangents):
+def _trace_jvp(primals: Any, tangents: Any) -> tuple[Scalars, Scalars]:
     return trace(*primals), (identity(tangents[0]) * tangents[0]).sum((0, 1))
 
 
@@ -55,7 +58,7 @@ def determinant(a: Tensors) -> Scalars:
 
 
 @determinant.defjvp
-def _determinant_jvp(primals, tangents):
+def _determinant_jvp(primals: Any, tangents: Any) -> tuple[Scalars, Scalars]:
     return determinant(*primals), (cofactors(*primals) * tangents[0]).sum((0, 1))
 
 
