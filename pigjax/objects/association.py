@@ -77,7 +77,7 @@ def associate_masks(
         Gaussian becomes background.
 
     Raises:
-        InputError: no views, masks that do not fit the cameras or show no Gaussian at all, negative ids, or thresholds
+        InputError: no views, masks that do not fit the cameras or show no Gaussian, negative ids, or thresholds
             outside [0, 1].
     """
     check_masks(cameras, per_view_masks)
