@@ -68,8 +68,8 @@ def associate_masks(
             early view knows only a part of an object.
         merge: groups are merged where one mask holds both in more than this share of the views that show both; a
             majority by default. 1 merges none, for masks that are known to be whole objects.
-        tau_T: transmittance below which the surface lies, in [0, 1]; the paper's default.
-        tau_d: depth tolerance relative to the surface depth, in [0, 1]; the paper's default.
+        tau_T: transmittance below which the surface lies, in [0, 1]; as of `lift_masks`.
+        tau_d: depth tolerance relative to the surface depth, in [0, 1]; as of `lift_masks`.
         config: the renderer's settings.
 
     Returns:
