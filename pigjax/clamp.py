@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import array_field, in_precision, is_known, static_field
+from pigjax.core.arrays import in_precision, is_known, real_field, static_field
 from pigjax.core.checks import Limits, check_fields, shown
 from pigjax.core.errors import InputError
 from pigjax.core.linalg import aligned_svd, matmul3, polar, quat_to_matrix, svd
@@ -35,11 +35,11 @@ class ClampParams(eqx.Module):
     """
 
     # of the rest scale [-], or [m] if not relative
-    tau_min: Float[Array, "*batch"] = array_field(default=0.5, limits=Limits(0, 1e9))
-    tau_max: Float[Array, "*batch"] = array_field(default=2.0, limits=Limits(0, 1e9, above=True))
-    lambda_R: Float[Array, "*batch"] = array_field(default=1.2, limits=Limits(-1e3, 1e3))  # R^t = R + lambda_R (R' - R)
+    tau_min: Float[Array, "*batch"] = real_field(default=0.5, limits=Limits(0, 1e9))
+    tau_max: Float[Array, "*batch"] = real_field(default=2.0, limits=Limits(0, 1e9, above=True))
+    lambda_R: Float[Array, "*batch"] = real_field(default=1.2, limits=Limits(-1e3, 1e3))  # R^t = R + lambda_R (R' - R)
     # S^t = S + lambda_S (S^tau - S)
-    lambda_S: Float[Array, "*batch"] = array_field(default=0.8, limits=Limits(-1e3, 1e3))
+    lambda_S: Float[Array, "*batch"] = real_field(default=0.8, limits=Limits(-1e3, 1e3))
     relative: bool = static_field(default=True)  # tau in units of each rest scale, else in metres
 
     def __check_init__(self):

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Num
 from scipy.spatial import cKDTree
 
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import Scalar, array_field, in_precision, is_known
+from pigjax.core.arrays import Scalar, array_field, in_precision, is_known, real_field
 from pigjax.core.camera import Camera, project
 from pigjax.core.errors import InputError
 from pigjax.splat import Gaussians, RenderConfig, Splats, backproject, pairs_of, render, required_capacity
@@ -39,7 +39,7 @@ class Labels(eqx.Module):
 
     object_id: Int[Array, "n"] = array_field()  # 0 = background or contested, -1 = never seen
     votes: Num[Array, "n m"] = array_field()  # views (or alpha·T, or soft counts) for each id, background in column 0
-    confidence: Float[Array, "n"] = array_field()  # share of the votes that the winner took, 0 where never seen
+    confidence: Float[Array, "n"] = real_field()  # share of the votes that the winner took, 0 where never seen
     overflow: Int[Array, ""] | None = None  # splat/tile pairs that the renderer dropped, over all views
     ids: Int[Array, "m"] | None = None  # id of each column of `votes`; None: column k counts id k
 

@@ -339,7 +339,7 @@ def test_tabletop_gaussians_get_their_true_ids_from_eight_views():
     found = np.asarray(labels.object_id)
     right, seen = np.mean(found == truth), np.mean(found >= 0)
     print(f"8 views: {right:.4f} right, {seen:.4f} seen")
-    # all 32 views give 0.999 (benchmarks/bench_segmentation.py); eight leave some Gaussians unseen
+    # all 32 views give 0.999 (benchmarks/segmentation); eight leave some Gaussians unseen
     assert right > 0.97
     filled = np.mean(np.asarray(fill_unseen(gaussians, labels).object_id) == truth)
     assert filled > 0.985

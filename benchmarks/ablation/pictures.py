@@ -2,9 +2,6 @@
 
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -17,7 +14,7 @@ def write_row(path: Path, frames: dict) -> None:
     images = {name: np.clip(np.asarray(frame.rgb), 0, 1) for name, frame in frames.items()}
     reference = images["reference"]
     side = len(reference) // _INSET
-    # "fixed" and "literal" fail everywhere; the inset shows what the two serious modes make of the worst place
+    # "fixed" and "literal" fail everywhere; the inset shows the worst place of the two serious modes
     wrong = np.mean([np.abs(images[name] - reference).mean(-1) for name in ("covariance", "aligned")], 0)
     half = side // 2
     inner = uniform_filter(wrong, side)[half : len(wrong) - side + half, half : len(wrong) - side + half]

@@ -1,15 +1,15 @@
 """A truth for deformed splats: each Gaussian as many small ones that matter carries one by one.
 
 A large Gaussian can only follow the deformation gradient at its centre. Its parts follow the field itself, each so
-small that the field is affine over it; together they are what the Gaussian's own matter would look like. At rest, and
+small that the field is affine over it; together they look as the Gaussian's own matter would. At rest, and
 under any affine field, the parts reproduce the Gaussian.
 
 How: alpha = o G composites as optical depth τ = -log(1 - o G), which adds up over parts. τ is written as a sum of
 centred Gaussians of several widths, non-negative least squares; each of these is a lattice of Gaussians of a smaller
 width. A part's own alpha is chosen so that its optical depth has the right integral over the image (a dilogarithm).
 As in all of splatting, opacity belongs to the image and not to a volume: the amplitudes depend on the projection and
-are found anew for each camera and deformation. Parts are drawn in the order of their Gaussians, so that shape alone
-differs from what a mode of `eigen_clamp` draws. `order="parts"` sorts each by its own depth instead.
+are recomputed for each camera and deformation. Parts are drawn in the order of their Gaussians, so that shape alone
+differs from the picture of a mode of `eigen_clamp`. `order="parts"` sorts each by its own depth instead.
 """
 
 from functools import partial

@@ -1,7 +1,6 @@
 """Three objects and how they deform: `field(positions)` gives where matter goes and F, everywhere in the object."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,19 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 
 import pigjax as pj
+from benchmarks.common.pages import TABLETOP
 from pigjax.core.camera import Camera, look_at
+from pigjax.core.gaussians import SH_CONSTANT
 from pigjax.mpm import fit_grid
 from pigjax.mpm.colliders import Plane
 from pigjax.scene import load_scene
 from pigjax.scene.plan import read_inputs, segment
 
-ROOT = Path(__file__).parents[2]
 Field = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Subject(NamedTuple):
     name: str
-    told: str  # what happens to it
+    told: str  # its deformation, for the page
     gaussians: pj.Gaussians  # the object alone, without view-dependent colour
     field: Field  # positions [m 3] at rest to positions [m 3] and F [m 3 3]
     size: float  # largest standard deviation of the reference's parts [m]
@@ -114,7 +114,7 @@ def textured_ball(count: int = 700, radius: float = 0.1) -> pj.Gaussians:
     longitude = np.arctan2(normal[:, 1], normal[:, 0])
     stripes = (np.floor(longitude / (np.pi / 5)) + np.floor(4 * (normal[:, 2] + 1))) % 2
     colour = np.where(stripes[:, None] > 0, [0.85, 0.25, 0.15], [0.1, 0.35, 0.65])
-    sh = (colour - 0.5)[:, None] / 0.28209479177387814
+    sh = (colour - 0.5)[:, None] / SH_CONSTANT
     parts = radius * normal, log_scales, quats, np.full(count, 2.5), sh
     return pj.Gaussians(*(jnp.asarray(part, jnp.float32) for part in parts))
 
@@ -136,10 +136,10 @@ def _middle(gaussians):
 
 
 def _objects(names: list[str]) -> dict[str, pj.Gaussians]:
-    """Objects of the bundled tabletop, as their masks cut them out; without what floats apart or is hardly there."""
+    """Objects of the bundled tabletop, cut out by their masks, without floaters and nearly transparent Gaussians."""
     if not names:
         return {}
-    scene = load_scene(ROOT / "examples/tabletop/scene.toml")
+    scene = load_scene(TABLETOP / "scene.toml")
     inputs = read_inputs(scene)
     object_id = np.asarray(segment(scene, inputs).object_id)
     found = {}

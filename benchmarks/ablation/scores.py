@@ -1,4 +1,4 @@
-"""What the ablation measures: needles among splats, holes and spill in images, PSNR and SSIM."""
+"""Scores of the ablation: needles among splats, holes and spill in images, PSNR and SSIM."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float

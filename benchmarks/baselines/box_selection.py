@@ -1,4 +1,4 @@
-"""An object is what lies in its box: the way of PhysGaussian (Xie et al., CVPR 2024).
+"""Objects are the Gaussians in boxes: the method of PhysGaussian (Xie et al., CVPR 2024).
 
 There a user sets an axis-aligned box by hand. Here known labels set it, and the training views choose how many
 outliers it may leave out: a better box than eyes would find.
@@ -6,10 +6,9 @@ outliers it may leave out: a better box than eyes would find.
 
 import numpy as np
 
+from benchmarks.baselines.choice import choose
 from pigjax.io import Views
 from pigjax.splat import Gaussians
-
-from .choice import choose
 
 PERCENTILES = (0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0)  # left out at each end of each axis
 

@@ -5,15 +5,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.baselines.training import draw
 from pigjax.core.camera import Camera
 from pigjax.io import Views
 from pigjax.splat import Gaussians
 
-from .training import draw
-
 
 def choose(gaussians: Gaussians, candidates: np.ndarray, views: Views) -> tuple[np.ndarray, dict[int, int]]:
-    """Of candidate members [c n m], the best for each id [n m] and its index: mean IoU of what is visible of it."""
+    """Of candidate members [c n m], the best for each id [n m] and its index: mean IoU of its visible part."""
     num_ids = candidates.shape[-1]
     members = jnp.asarray(np.moveaxis(candidates, 0, 1), jnp.float32)
     scores = [_overlaps(gaussians, members, views.cameras[view], views.masks[view]) for view in range(len(views))]
@@ -23,7 +22,7 @@ def choose(gaussians: Gaussians, candidates: np.ndarray, views: Views) -> tuple[
 
 @eqx.filter_jit
 def _overlaps(gaussians: Gaussians, members: jax.Array, camera: Camera, mask: np.ndarray) -> jax.Array:
-    """IoU [c m] in one view of what is visible of candidate members [n c m]; 0 where it is not shown."""
+    """IoU [c m] in one view of the visible part of candidate members [n c m]; 0 where it is not shown."""
     count, candidates, num_ids = members.shape
     shares = draw(gaussians, members.reshape(count, -1), camera)
     drawn = shares.reshape(*mask.shape, candidates, num_ids) > 0.5

@@ -12,12 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from benchmarks.baselines.choice import choose
+from benchmarks.baselines.training import Fitted, draw, fit
 from pigjax.core.camera import Camera
 from pigjax.io import Views
 from pigjax.splat import Gaussians
-
-from .choice import choose
-from .training import Fitted, draw, fit
 
 RATE = 1e-2  # of Adam at the start
 THRESHOLDS = tuple(np.round(np.arange(0.1, 1.0, 0.1), 1).tolist())

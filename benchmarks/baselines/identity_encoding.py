@@ -15,11 +15,10 @@ import numpy as np
 import optax
 from scipy.spatial import cKDTree
 
+from benchmarks.baselines.training import Fitted, draw, fit
 from pigjax.core.camera import Camera
 from pigjax.io import Views
 from pigjax.splat import Gaussians
-
-from .training import Fitted, draw, fit
 
 WIDTH = 16
 FEATURE_RATE, CLASSIFIER_RATE = 2.5e-2, 5e-3  # of Adam at the start
@@ -27,7 +26,7 @@ NEIGHBOURS, SAMPLED, INTERVAL, WEIGHT = 5, 1000, 5, 2.0  # of the term in space:
 
 
 class Encoding(NamedTuple):
-    """What is trained."""
+    """Parameters that are trained."""
 
     features: jax.Array  # [n 16] of the Gaussians
     kernel: jax.Array  # [16 m] of the classifier

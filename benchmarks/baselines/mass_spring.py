@@ -1,4 +1,4 @@
-"""A network of masses and springs in place of a continuum: the way of Spring-Gaus (Zhong et al., ECCV 2024).
+"""A network of masses and springs in place of a continuum: the method of Spring-Gaus (Zhong et al., ECCV 2024).
 
 Kept: anchors sampled in the filled object, springs to the nearest anchors with a damper in each, semi-implicit Euler,
 ground contact of anchors, Gaussians moved by inverse-distance weights of the nearest anchors with shapes as they were.
@@ -57,9 +57,9 @@ def stable_step(network: Network) -> float:
 def spring_forces(network: Network, x: jax.Array, v: jax.Array) -> jax.Array:
     """Forces [a 3] of springs and of dampers along them."""
     first, second = network.pairs.T
-    way = x[second] - x[first]
-    length = jnp.maximum(jnp.linalg.norm(way, axis=1), 1e-12)
-    direction = way / length[:, None]
+    between = x[second] - x[first]
+    length = jnp.maximum(jnp.linalg.norm(between, axis=1), 1e-12)
+    direction = between / length[:, None]
     closing = jnp.sum((v[second] - v[first]) * direction, 1)
     pull = (network.stiffness * (length - network.length) + network.damping * closing)[:, None] * direction
     return jnp.zeros_like(x).at[first].add(pull).at[second].add(-pull)
@@ -68,7 +68,7 @@ def spring_forces(network: Network, x: jax.Array, v: jax.Array) -> jax.Array:
 def advance(network: Network, x, v, dt, steps: int, *, gravity, collider=None):
     """Positions and velocities [a 3] after semi-implicit Euler steps of dt [s]; `steps` may be traced.
 
-    At a collider velocity is what the collider's contact leaves of it, and anchors in it are put on its surface.
+    A collider's contact limits the velocity, and anchors inside the collider are put on its surface.
     """
 
     def step(_, state):

@@ -1,4 +1,4 @@
-"""Few particles drive many Gaussians rigidly: the way of PhysDreamer (Zhang et al., ECCV 2024, arXiv 2404.13026).
+"""Few particles drive many Gaussians rigidly: the method of PhysDreamer (Zhang et al., ECCV 2024, arXiv 2404.13026).
 
 Kept: driving particles are the k-means centres of a filled object; each carries material parameters of its own; a
 Gaussian follows its 8 nearest ones by the rotation that fits their motion best (Kabsch 1976), about their mean, and

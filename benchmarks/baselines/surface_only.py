@@ -1,4 +1,4 @@
-"""Gaussians above a feature threshold are the matter: the way of Feature Splatting (Qiu et al., ECCV 2024).
+"""Gaussians above a feature threshold are the matter: the method of Feature Splatting (Qiu et al., ECCV 2024).
 
 Kept: features distilled into Gaussians, objects by a threshold on their cosine with a query, MPM on the Gaussians
 chosen, which give their positions to what is drawn and keep their shapes. Left out: CLIP (features are perfect ones of

@@ -16,7 +16,7 @@ CHECKPOINTS = (1 / 8, 1 / 4, 1 / 2, 1)  # shares of the steps after which the pa
 
 
 class Fitted(NamedTuple):
-    """Parameters at the checkpoints and what they cost."""
+    """Parameters at the checkpoints, and their cost."""
 
     params: dict[int, Any]  # by the number of steps done, the last one is the result
     losses: np.ndarray  # [steps]

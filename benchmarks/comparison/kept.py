@@ -10,7 +10,7 @@ import numpy as np
 
 
 def kept(folder: Path | None, name: str, make: Callable[[], Any]) -> Any:
-    """The pytree that `make` gives, from the folder if it is there; without a folder it is made anew."""
+    """The pytree that `make` gives, from the folder if it is there; without a folder it is made again."""
     path = folder / f"{name}.pickle" if folder else None
     if path and path.exists():
         return pickle.loads(path.read_bytes())

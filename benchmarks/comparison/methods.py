@@ -1,7 +1,5 @@
 """The methods: each moves the same Gaussians for the same frames, as far as it can be with the same engine."""
 
-import statistics
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -11,12 +9,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from baselines import mass_spring
-from baselines.feature_distillation import select_by_similarity, similarities, train_features
-from baselines.region_boxes import ids_in_boxes
-from baselines.rigid_topk import driving_points, follow, nearest_drivers
-from baselines.surface_only import ids_by_members
 
+from benchmarks.baselines import mass_spring
+from benchmarks.baselines.feature_distillation import select_by_similarity, similarities, train_features
+from benchmarks.baselines.region_boxes import ids_in_boxes
+from benchmarks.baselines.rigid_topk import driving_points, follow, nearest_drivers
+from benchmarks.baselines.surface_only import ids_by_members
+from benchmarks.common.timing import frames_of
+from benchmarks.comparison.setting import DENSITY, FRICTION, GRAVITY, TABLE, VELOCITIES, YOUNG, Setting, subset
 from pigjax.clamp import ClampParams
 from pigjax.coupling.binding import bind, deform
 from pigjax.coupling.sdf_collider import collider_from_gaussians
@@ -29,22 +29,20 @@ from pigjax.objects.lifting import lift
 from pigjax.splat import Splats
 from pigjax.splatting.types import as_splats
 
-from .setting import DENSITY, FRICTION, GRAVITY, TABLE, VELOCITIES, YOUNG, Setting, subset
-
 CHOICE_EVERY = 4  # training views that choose thresholds
-TRAINING_STEPS = 100  # of features: most Gaussians are right then, see docs/SEGMENTATION.md
+TRAINING_STEPS = 100  # of features: most Gaussians are right then, see docs/results/SEGMENTATION.md
 DRIVERS = 2000  # particles that drive, of all objects together
 ANCHORS = 2048  # as in Spring-Gaus
 
 
 class Motion(NamedTuple):
-    """What a method made of the scene."""
+    """Motion of the scene by one method."""
 
     frames: list[Splats]  # rest first
     particles: int
     substeps: int  # per frame
     seconds: float  # of all frames, from the median frame: without compilation
-    compile_seconds: float  # what the frames took beyond that
+    compile_seconds: float  # of the frames, beyond that
 
 
 def ours(setting: Setting, ids: np.ndarray) -> Motion:
@@ -102,7 +100,7 @@ def as_spring_gaus(setting: Setting, ids: np.ndarray) -> Motion:
                               gravity=jnp.asarray(GRAVITY, jnp.float32), collider=setting.plane))  # fmt: skip
     start = jnp.asarray(x, jnp.float32)
     velocity = jnp.asarray([VELOCITIES.get(names[row], (0.0, 0.0, 0.0)) for row in number], jnp.float32)
-    states, seconds, compile_seconds = _timed(lambda state: advance(*state), (start, velocity), setting.frames)
+    run = frames_of(lambda state: advance(*state), (start, velocity), setting.frames)
 
     rest = as_splats(setting.gaussians)
     near, weights = np.full((len(ids), 8), -1), np.zeros((len(ids), 8))
@@ -115,7 +113,8 @@ def as_spring_gaus(setting: Setting, ids: np.ndarray) -> Motion:
         moved = jnp.einsum("nk,nkj->nj", jnp.asarray(weights, jnp.float32), (state[0] - start)[near])
         return _with(rest, rest.means + moved, rest.factors)
 
-    return Motion([posed(state) for state in states], len(x), steps, seconds, compile_seconds)
+    seconds = run.seconds * setting.frames
+    return Motion([posed(state) for state in run.result], len(x), steps, seconds, run.compile_seconds)
 
 
 def lifted_ids(setting: Setting) -> np.ndarray:
@@ -134,7 +133,7 @@ def feature_ids(setting: Setting, steps: int = TRAINING_STEPS) -> np.ndarray:
 
 
 def all_methods(setting: Setting, kept: Callable[..., np.ndarray]) -> dict[str, Callable[[], Motion]]:
-    """By name, each to be called when its turn comes; `kept(name, make)` holds what several of them use."""
+    """By name, each to be called when its turn comes; `kept(name, make)` holds ids that several of them use."""
 
     def by_masks() -> np.ndarray:
         return kept("ids of masks", lambda: lifted_ids(setting))
@@ -182,19 +181,8 @@ def _simulate(setting, particles, table, collider):
     near = fit_grid(particles.x, setting.dx)
     substeps = choose_substeps(particles, near, table, config, frames=setting.frames, **steps)
     config, domain = replace(config, substeps=substeps), vast_grid(setting.dx)
-    states, *cost = _timed(lambda p: rollout(p, domain, table, config, frames=1, **steps)[0], particles, setting.frames)
-    return states, substeps, *cost
-
-
-def _timed(step, state, frames):
-    """All states, seconds by the median frame, and what was taken beyond: compilation, mostly."""
-    states, times = [state], []
-    for _ in range(frames):
-        begun = time.perf_counter()
-        states.append(jax.block_until_ready(step(states[-1])))
-        times.append(time.perf_counter() - begun)
-    seconds = statistics.median(times) * frames
-    return states, seconds, max(sum(times) - seconds, 0.0)
+    run = frames_of(lambda p: rollout(p, domain, table, config, frames=1, **steps)[0], particles, setting.frames)
+    return run.result, substeps, run.seconds * setting.frames, run.compile_seconds
 
 
 def _reduced(particles, count):

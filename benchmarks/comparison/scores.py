@@ -21,8 +21,8 @@ def carriers(solid: np.ndarray, rest: np.ndarray, neighbours: int = 8) -> tuple[
 def carried(solid: np.ndarray, rest: np.ndarray, moved: np.ndarray, near: np.ndarray, weights: np.ndarray):
     """Points [p 3] of a solid after its Gaussians went from rest to moved [n 3].
 
-    The rigid motion that fits the Gaussians best (Kabsch 1976), and what their `carriers` do beyond it: exact for rigid
-    motion, and near the surface exact for any.
+    The rigid motion that fits the Gaussians best (Kabsch 1976), and the displacements of their `carriers` beyond it:
+    exact for rigid motion, and near the surface exact for any.
     """
     middle, now = rest.mean(0), moved.mean(0)
     left, _, right = np.linalg.svd((moved - now).T @ (rest - middle))
@@ -33,7 +33,7 @@ def carried(solid: np.ndarray, rest: np.ndarray, moved: np.ndarray, near: np.nda
 
 
 def shared_volume(solids: list[np.ndarray], volumes: list[np.ndarray], spacing: float) -> float:
-    """Volume that several solids claim: in voxels of 4 spacings, what their shares (1 at most each) exceed 1 by.
+    """Volume that several solids claim: in voxels of 4 spacings, the excess over 1 of the sum of their shares.
 
     Solids that only touch share nothing, even within a voxel; where they overlap, voxels that both fill in part count
     for less than they hold, so the number is a lower bound that tends to the true one as voxels shrink.
@@ -69,7 +69,7 @@ def needle_share(factors: np.ndarray, rest_scales: np.ndarray, aspect: float = 4
 def hole_share(alpha: np.ndarray, still: np.ndarray, opaque: float = 0.9, open_below: float = 0.5) -> float:
     """Share of the pixels that the still scene alone makes opaque which are open at the end; alphas [h w].
 
-    What cameras never saw, as the table below an object, is open in both and is no hole.
+    Surfaces that cameras never saw, as the table below an object, are open in both and are no hole.
     """
     solid = still > opaque
     return float(np.mean(alpha[solid] < open_below)) if solid.any() else 0.0

@@ -1,12 +1,12 @@
-"""The paper's comparison on the bundled tabletop: what every method is given."""
+"""The paper's comparison on the bundled tabletop: inputs of every method."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from segmentation.tabletop import TABLE, Tabletop, load_tabletop
 
+from benchmarks.segmentation.tabletop import TABLE, Tabletop, load_tabletop
 from pigjax.core.camera import Camera, look_at
 from pigjax.coupling.filling import fill_interior
 from pigjax.mpm.colliders import Plane

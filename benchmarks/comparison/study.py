@@ -1,26 +1,24 @@
 """Scores of a motion in one row, and its pictures."""
 
 import jax
-import matplotlib
 import numpy as np
 
-from pigjax.splat import RenderConfig, render
+from benchmarks.common.pages import head, row
+from benchmarks.comparison import scores
+from benchmarks.comparison.methods import Motion
+from benchmarks.comparison.setting import FINE, TABLE, Setting, camera, subset
+from pigjax.splat import render
 from pigjax.splatting.types import as_splats
 
-from . import scores
-from .methods import Motion
-from .setting import FINE, TABLE, Setting, camera, subset
-
-matplotlib.use("Agg")
 MOVED = 0.002  # [m]
-HEADER = (
-    "| method | particles | overlap of objects [cm³] | in the table [cm³] | still splats moved | needles | holes |"
-    " torn off | time [s] | compile [s] |\n" + "|---" * 10 + "|"
-)
+HEADER = head(
+    "method", "particles", "overlap of objects [cm³]", "in the table [cm³]", "still splats moved", "needles", "holes",
+    "torn off", "time [s]", "compile [s]",
+)  # fmt: skip
 
 
 class Truth:
-    """What scores compare with, made once."""
+    """The truth that scores compare with, made once."""
 
     def __init__(self, setting: Setting):
         self.setting, self.solids = setting, setting.solids()
@@ -32,7 +30,7 @@ class Truth:
         self.links = {number: scores.link_length(self.rest[rows]) for number, rows in self.rows.items()}
         table = subset(setting.gaussians, np.flatnonzero(setting.scene.truth == TABLE))
         self.camera = camera()
-        self.still_alpha = np.asarray(render(as_splats(table), self.camera, _config(), outputs=("alpha",)).alpha)
+        self.still_alpha = np.asarray(render(as_splats(table), self.camera, outputs=("alpha",)).alpha)
 
     def penetration(self, means: np.ndarray) -> tuple[float, float]:
         """Volume [m³] that objects share with each other, and with the true table."""
@@ -45,8 +43,8 @@ class Truth:
         return scores.shared_volume(moved, self.volumes, FINE), inside
 
 
-def row(name: str, motion: Motion, truth: Truth) -> str:
-    """Worst frame of penetration and needles, less what is there at rest; the end for all else."""
+def score_row(name: str, motion: Motion, truth: Truth) -> str:
+    """Worst frame of penetration and needles, less that at rest; the end for all else."""
     means = [np.asarray(frame.means, float) for frame in motion.frames]
     each = np.array([truth.penetration(at) for at in means])
     overlap, sunk = 1e6 * (each.max(0) - each[0])
@@ -56,21 +54,19 @@ def row(name: str, motion: Motion, truth: Truth) -> str:
     torn = [len(rows) * scores.torn_share(end[rows], truth.links[n]) for n, rows in truth.rows.items()]
     held = [len(rows) * scores.torn_share(truth.rest[rows], truth.links[n]) for n, rows in truth.rows.items()]
     count = sum(map(len, truth.rows.values()))
-    alpha = np.asarray(render(motion.frames[-1], truth.camera, _config(), outputs=("alpha",)).alpha)
+    alpha = np.asarray(render(motion.frames[-1], truth.camera, outputs=("alpha",)).alpha)
     holes = scores.hole_share(alpha, truth.still_alpha)
     shares = (moved, needles, holes, max(sum(torn) - sum(held), 0) / count)
-    listed = " | ".join(f"{100 * share:.2f} %" for share in shares)
-    return (
-        f"| {name} | {motion.particles} | {overlap:.1f} | {sunk:.1f} | {listed} | {motion.seconds:.1f}"
-        f" | {motion.compile_seconds:.1f} |"
-    )
+    listed = [f"{100 * share:.2f} %" for share in shares]
+    times = f"{motion.seconds:.1f}", f"{motion.compile_seconds:.1f}"
+    return row(name, motion.particles, f"{overlap:.1f}", f"{sunk:.1f}", *listed, *times)
 
 
 def pictures(motion: Motion, count: int = 5) -> list[np.ndarray]:
     """Frames from the first to the last, seen by the same camera."""
     view = camera()
     chosen = np.linspace(0, len(motion.frames) - 1, count).round().astype(int)
-    draw = jax.jit(lambda splats: render(splats, view, _config(), background=1.0, outputs=("rgb",)).rgb)
+    draw = jax.jit(lambda splats: render(splats, view, background=1.0, outputs=("rgb",)).rgb)
     return [np.clip(np.asarray(draw(motion.frames[i])), 0, 1) for i in chosen]
 
 
@@ -90,7 +86,3 @@ def draw_rows(rows: dict[str, list[np.ndarray]], times: np.ndarray, path) -> Non
         axis.set_title(f"{seconds:.3f} s", fontsize=8)
     figure.savefig(path, dpi=100, pil_kwargs={"quality": 85})
     plt.close(figure)
-
-
-def _config() -> RenderConfig:
-    return RenderConfig()

@@ -1,26 +1,26 @@
 """Masks whose ids were scrambled in every view, associated again, against masks with consistent ids."""
 
-import time
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from benchmarks.common.pages import head, row
+from benchmarks.common.timing import clock
+from benchmarks.segmentation.tabletop import Tabletop, mean_scores, scores_by_object
 from pigjax.objects.association import associate_masks
 from pigjax.segmentation import fill_unseen, lift_masks
-from segmentation.tabletop import Tabletop, mean_scores, scores_by_object
-
-HEADER = """| masks | ids found | Gaussians right | of consistent masks | mIoU | mBIoU | of consistent mIoU | time [s] |
-|---|---|---|---|---|---|---|---|"""
 
 
-def study(scene: Tabletop) -> list[str]:
-    """Rows of a table: share of Gaussians right, and 2D scores on the test views, of scrambled and of true ids.
+def study(scene: Tabletop, _) -> None:
+    """Prints a table: share of Gaussians right, and 2D scores on the test views, of scrambled and of true ids.
 
     Each spoiled set of masks is compared with itself under consistent ids; whole masks are the reference of split ones.
     """
     assert scene.truth is not None
-    rows = []
+    print(head("masks", "ids found", "Gaussians right", "of consistent masks", "mIoU", "mBIoU", "of consistent mIoU",
+               "time [s]"))  # fmt: skip
     for name, options in {
         "whole": {},
         "every second view": {"every": 2},
@@ -35,19 +35,16 @@ def study(scene: Tabletop) -> list[str]:
         train = scene.train[::every]
         consistent, scrambled = spoil(train.masks, **options)
         expected = score(scene, train.cameras, consistent, scene.num_ids)
-        start = time.perf_counter()
-        found = associate_masks(scene.gaussians, train.cameras, scrambled)
-        seconds = time.perf_counter() - start
+        seconds, found = clock(partial(associate_masks, scene.gaussians, train.cameras, scrambled))
         right, iou, boundary = score(scene, train.cameras, found.masks, found.num_ids)
-        rows.append(
-            f"| {name} | {found.num_ids - 1} of {scene.num_ids - 1} | {right:.4f} | {right / expected[0]:.3f} "
-            f"| {iou:.2f} | {boundary:.2f} | {iou / expected[1]:.3f} | {seconds:.1f} |"
-        )
-    return rows
+        print(
+            row(name, f"{found.num_ids - 1} of {scene.num_ids - 1}", f"{right:.4f}", f"{right / expected[0]:.3f}",
+                f"{iou:.2f}", f"{boundary:.2f}", f"{iou / expected[1]:.3f}", f"{seconds:.1f}")
+        )  # fmt: skip
 
 
 def spoil(masks, *, missing=0.0, split=0.0, fused=0.0, seed=0) -> tuple[np.ndarray, np.ndarray]:
-    """Masks with consistent ids but for what is missing or fused, and with ids of 16 bits that differ in every view."""
+    """Masks with consistent ids except missing and fused ones, and masks with other ids of 16 bits in every view."""
     rng = np.random.default_rng(seed)
     consistent, scrambled = np.array(masks, np.int32), np.zeros(masks.shape, np.int32)
     for mask, out in zip(consistent, scrambled):

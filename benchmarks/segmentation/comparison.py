@@ -1,28 +1,26 @@
-"""Votes against what rivals do, on the same Gaussians, views and scores; `study` gives the tables and a picture."""
+"""Votes and rivals' methods on the same Gaussians, views and scores; `study` gives the tables and a picture."""
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
-from baselines.box_selection import select_by_box
-from baselines.feature_distillation import image_similarities, select_by_similarity, train_features
-from baselines.identity_encoding import encoded_ids, image_ids, train_encoding
-from baselines.training import Fitted
 
+from benchmarks.baselines.box_selection import select_by_box
+from benchmarks.baselines.feature_distillation import image_similarities, select_by_similarity, train_features
+from benchmarks.baselines.identity_encoding import encoded_ids, image_ids, train_encoding
+from benchmarks.baselines.training import Fitted
+from benchmarks.common.pages import TABLETOP, head, picture, row
+from benchmarks.common.timing import timed
+from benchmarks.segmentation.tabletop import TABLE, Tabletop, mean_scores, scores_by_object
 from pigjax.core.metrics import score_masks
-from pigjax.io import Views
+from pigjax.io import Views, load_ply
 from pigjax.segmentation import fill_unseen, lift_masks
 from pigjax.splat import Gaussians, render
 
-from .tabletop import TABLE, mean_scores, scores_by_object
-
-matplotlib.use("Agg")
-
+PICTURE = "segmentation_baselines.png"
 OURS = {
     "pigjax, vote": {},
     "pigjax, alpha·T credits": {"weighting": "alpha"},
@@ -32,8 +30,8 @@ CHOICE_EVERY = 4  # thresholds and boxes are chosen on every fourth training vie
 RIGHT, TOO_MUCH, MISSED = (0.35, 0.70, 0.40), (0.85, 0.20, 0.15), (0.20, 0.40, 0.85)
 
 
-class Row(NamedTuple):
-    """One answer: which Gaussians are which object, and what it took."""
+class Answer(NamedTuple):
+    """One answer: Gaussians of each object, and its cost."""
 
     name: str
     members: np.ndarray  # [n m] bool; a Gaussian may be in several objects, or in none
@@ -49,7 +47,17 @@ class Learnt(NamedTuple):
     name: str
     fitted: Fitted
     members: Callable[..., np.ndarray]  # of parameters
-    masks: Callable[..., np.ndarray]  # of camera: what the images themselves say of each id, [h w m] bool
+    masks: Callable[..., np.ndarray]  # of camera: pixels of each id by the images themselves, [h w m] bool
+
+
+def compare(scene: Tabletop, options) -> str:
+    """Ours and rivals' methods re-made on the same renderer, on the trained scene and on the cloud with known ids."""
+    bundled = load_ply(TABLETOP / "tabletop.ply")
+    views, steps = (scene.train, scene.test, scene.names), options.steps
+    on_trained = study(bundled, *views, options.media, steps=steps)
+    on_cloud = study(scene.gaussians, *views, None, truth=scene.truth, steps=steps)
+    shown = picture(PICTURE, "truth, ours, rivals")
+    return f"Trained scene:\n\n{on_trained}\n\n{shown}\n\nCloud with known ids:\n\n{on_cloud}"
 
 
 def study(
@@ -60,10 +68,10 @@ def study(
     folder: Path | None,
     *,
     truth: np.ndarray | None = None,
-    steps: int = 800,
+    steps: int,
     pictured: str = "duck",
 ) -> str:
-    """Tables in Markdown, and `segmentation_baselines.png` in the folder, if one is given.
+    """Tables in Markdown, and the picture in the folder, if one is given.
 
     Args:
         gaussians: the scene, whose geometry stays as it is.
@@ -87,49 +95,47 @@ def study(
     boxes, percentiles = select_by_box(gaussians, known, num_ids, chosen_on)
     learnt, thresholds = _learn(gaussians, train, chosen_on, num_ids, steps, one_hot)
 
-    def measured(row: Row) -> Row:
-        return row._replace(scores=_scores(row, gaussians, test, ids, truth))
+    def measured(answer: Answer) -> Answer:
+        return answer._replace(scores=_scores(answer, gaussians, test, ids, truth))
 
-    curves = [[measured(row) for row in _curve(method, len(train))] for method in learnt]
-    best = [max(curve, key=lambda row: row.scores[0]) for curve in curves]
-    box = measured(Row("axis-aligned box (as PhysGaussian)", boxes))
-    rows = [*map(measured, ours), *best, box]
-    ceiling = [] if truth is None else [measured(Row("true ids", one_hot(truth)))]
+    curves = [[measured(answer) for answer in _curve(method, len(train))] for method in learnt]
+    best = [max(curve, key=lambda answer: answer.scores[0]) for curve in curves]
+    box = measured(Answer("axis-aligned box (as PhysGaussian)", boxes))
+    answers = [*map(measured, ours), *best, box]
+    ceiling = [] if truth is None else [measured(Answer("true ids", one_hot(truth)))]
 
     columns = ["isolated mIoU", "mBIoU", "visible mIoU", "mBIoU"] + ([] if truth is None else ["Gaussians right"])
     lines = [
-        *_head("method", "steps", "time [s]", *columns),
-        *(_line(row) for row in rows + ceiling),
+        head("method", "steps", "time [s]", *columns),
+        *map(_line, answers + ceiling),
         "",
         "Learnt baselines are shown at their best checkpoint, chosen for them by the test views' isolated mIoU. Boxes"
         f" are those of {'our' if truth is None else 'the true'} labels, less the percentage at each end that training"
         f" views prefer ({_listed(percentiles, ids, names)}); cosine thresholds are chosen likewise, at the end of"
         f" training {_listed(thresholds, ids, names)}.",
         "",
-        *_head("while training", "steps", "time [s]", "loss", *columns),
-        *(_line(row, loss=True) for curve in curves for row in curve),
+        head("while training", "steps", "time [s]", "loss", *columns),
+        *(_line(answer, loss=True) for curve in curves for answer in curve),
         "",
-        *_head("asked in the image, not of Gaussians", "mIoU", "mBIoU"),
-        *(f"| {method.name} | %.1f | %.1f |" % _in_image(method, test, ids) for method in learnt),
+        head("asked in the image, not of Gaussians", "mIoU", "mBIoU"),
+        *(row(method.name, *(f"{score:.1f}" for score in _in_image(method, test, ids))) for method in learnt),
     ]
     if folder is not None:
         number = next(number for number, name in names.items() if name == pictured)
         trained = [*ours, *(curve[-1] for curve in curves), box]
-        draw_comparison(gaussians, trained, test, number, pictured, folder / "segmentation_baselines.png")
+        draw_comparison(gaussians, trained, test, number, pictured, folder / PICTURE)
     return "\n".join(lines)
 
 
-def _vote(name, gaussians, train, num_ids, one_hot, **settings) -> Row:
-    """Ours: the second call's time, since the first one compiles. What `min_seen` leaves out stays out."""
+def _vote(name, gaussians, train, num_ids, one_hot, **settings) -> Answer:
+    """Ours, warm. Gaussians that `min_seen` leaves out stay out."""
 
     def answer():
         labels = lift_masks(gaussians, train.cameras, train.masks, num_ids=num_ids, **settings)
         return np.asarray((labels if "min_seen" in settings else fill_unseen(gaussians, labels)).object_id)
 
-    answer()
-    begun = time.perf_counter()
-    object_id = answer()
-    return Row(name, one_hot(object_id), time.perf_counter() - begun)
+    found = timed(answer, windows=3)
+    return Answer(name, one_hot(found.result), found.seconds)
 
 
 def _learn(gaussians, train, chosen_on, num_ids, steps, one_hot) -> tuple[list[Learnt], dict[int, float]]:
@@ -155,16 +161,16 @@ def _learn(gaussians, train, chosen_on, num_ids, steps, one_hot) -> tuple[list[L
     return methods, thresholds
 
 
-def _curve(method: Learnt, views: int) -> list[Row]:
+def _curve(method: Learnt, views: int) -> list[Answer]:
     fitted = method.fitted
     return [
-        Row(method.name, method.members(params), fitted.seconds * step / len(fitted.losses), step,
+        Answer(method.name, method.members(params), fitted.seconds * step / len(fitted.losses), step,
             fitted.mean_loss(step, views))
         for step, params in fitted.params.items()
     ]  # fmt: skip
 
 
-def _scores(row: Row, gaussians, test, ids, truth) -> tuple[float, ...]:
+def _scores(answer: Answer, gaussians, test, ids, truth) -> tuple[float, ...]:
     """mIoU and mBIoU isolated and visible [%], and, where the truth is known, the share of Gaussians right [%].
 
     A Gaussian is right if it was given to the object that it is of, and to no other; table and background are no
@@ -174,11 +180,11 @@ def _scores(row: Row, gaussians, test, ids, truth) -> tuple[float, ...]:
     for mode in ("isolated", "visible"):
         by_object = {}
         for number in ids:
-            own = np.where(row.members[:, number], number, 0)
+            own = np.where(answer.members[:, number], number, 0)
             by_object |= scores_by_object(gaussians, own, test, [number], mode=mode)
         scores += mean_scores(by_object)
     if truth is not None:
-        scores.append(100 * np.mean((row.members[:, ids] == (truth[:, None] == ids)).all(1)))
+        scores.append(100 * np.mean((answer.members[:, ids] == (truth[:, None] == ids)).all(1)))
     return tuple(scores)
 
 
@@ -195,40 +201,37 @@ def _in_image(method: Learnt, test: Views, ids) -> tuple[float, float]:
     return 100 * scores.mean_iou, 100 * scores.mean_boundary_iou
 
 
-def _head(*columns: str) -> list[str]:
-    return ["| " + " | ".join(columns) + " |", "|---" * len(columns) + "|"]
-
-
-def _line(row: Row, *, loss: bool = False) -> str:
-    numbers = [f"{row.steps}" if row.steps else "none", "-" if row.seconds is None else f"{row.seconds:.3g}"]
-    numbers += [f"{row.loss:.4f}"] if loss else []
-    numbers += [f"{score:.1f}" for score in row.scores[:4]] + [f"{score:.2f} %" for score in row.scores[4:]]
-    return f"| {row.name} | " + " | ".join(numbers) + " |"
+def _line(answer: Answer, *, loss: bool = False) -> str:
+    seconds = "-" if answer.seconds is None else f"{answer.seconds:.3g}"
+    scores = [f"{score:.1f}" for score in answer.scores[:4]] + [f"{score:.2f} %" for score in answer.scores[4:]]
+    return row(answer.name, answer.steps or "none", seconds, *([f"{answer.loss:.4f}"] if loss else []), *scores)
 
 
 def _listed(values: dict[int, float], ids, names) -> str:
     return ", ".join(f"{names[number]} {values[number]:g}" for number in ids)
 
 
-def draw_comparison(gaussians: Gaussians, rows: list[Row], test: Views, number: int, name: str, path: Path) -> None:
+def draw_comparison(
+    gaussians: Gaussians, answers: list[Answer], test: Views, number: int, name: str, path: Path
+) -> None:
     """The object's Gaussians alone by each method in the test view that shows it largest, and where its mask errs."""
     import matplotlib.pyplot as plt
 
     view = int(np.argmax(np.sum(test.masks == number, (1, 2))))
     truth, camera = test.masks[view] == number, test.cameras[view]
-    figure, axes = plt.subplots(2, len(rows) + 1, figsize=(2.1 * (len(rows) + 1), 4.7), layout="constrained")
+    figure, axes = plt.subplots(2, len(answers) + 1, figsize=(2.1 * (len(answers) + 1), 4.7), layout="constrained")
     axes[0, 0].imshow(np.where(truth[..., None], test.images[view], 1.0))
     axes[1, 0].imshow(np.where(truth[..., None], RIGHT, 1.0))
     axes[0, 0].set_title(f"truth: {name}", fontsize=8)
-    for (above, below), row in zip(axes[:, 1:].T, rows):
-        chosen = jnp.asarray(row.members[:, number])
+    for (above, below), answer in zip(axes[:, 1:].T, answers):
+        chosen = jnp.asarray(answer.members[:, number])
         alone = jax.tree.map(lambda leaf, chosen=chosen: leaf[chosen], gaussians)
         frame = render(alone, camera, background=1.0, outputs=("rgb", "alpha"))
         above.imshow(np.clip(frame.rgb, 0, 1))
         found = np.asarray(frame.alpha) > 0.5
         below.imshow(np.select([(found & truth)[..., None], found[..., None], truth[..., None]],
                                [RIGHT, TOO_MUCH, MISSED], 1.0))  # fmt: skip
-        above.set_title(row.name.replace(" (as ", "\n(as "), fontsize=8)
+        above.set_title(answer.name.replace(" (as ", "\n(as "), fontsize=8)
     axes[0, 0].set_ylabel("its Gaussians alone", fontsize=8)
     axes[1, 0].set_ylabel("mask: right, too much (red),\nmissed or hidden (blue)", fontsize=8)
     for axis in axes.flat:

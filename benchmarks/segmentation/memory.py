@@ -1,14 +1,12 @@
-"""Peak memory and time of a vote on a large scene, each in a process of its own."""
+"""Peak memory and time of a vote on a large scene, in a process of its own."""
 
 import json
-import resource
-import subprocess
-import sys
-import time
 
-import jax
 import numpy as np
 
+from benchmarks.common.command import start_worker
+from benchmarks.common.pages import head, row
+from benchmarks.common.timing import clock, peak_memory
 from pigjax.core.camera import orbit
 from pigjax.segmentation import lift_masks
 from pigjax.splat import Gaussians
@@ -40,36 +38,22 @@ def large_scene(count: int, views: int, size: int, num_ids: int):
     return gaussians, cameras, masks
 
 
-def study(count: int = 1_000_000, num_ids: int = 256, views: int = 300, size: int = 256) -> str:
-    """A row of a table, measured in a child process: peak resident memory and seconds, compilation included."""
-    command = [sys.executable, "-m", "segmentation.memory", *map(str, (count, num_ids, views, size))]
-    result = subprocess.run(command, check=True, capture_output=True, text=True)
-    row = json.loads(result.stdout.splitlines()[-1])
-    return (
-        f"| {count:,} | {num_ids} | {views} x {size}² | {row['before']:.2f} | {row['peak']:.2f} | {row['votes']:.2f} "
-        f"| {row['seconds']:.0f} | {row['seen']:.3f} |"
-    )
+def study(options) -> str:
+    """A table of one row: peak resident memory and seconds, compilation included."""
+    count, num_ids, views, size = options.large
+    said, _ = start_worker("segmentation", *options.large).communicate()
+    found = json.loads(said.splitlines()[-1])
+    sizes = [f"{found[name]:.2f}" for name in ("before", "peak", "votes")]
+    columns = ("Gaussians", "ids", "views", "resident before [GB]", "peak [GB]", "of which votes [GB]", "time [s]")
+    numbers = (f"{count:,}", num_ids, f"{views} x {size}²", *sizes, f"{found['seconds']:.0f}", f"{found['seen']:.3f}")
+    return f"{head(*columns, 'share seen')}\n{row(*numbers)}"
 
 
-HEADER = """| Gaussians | ids | views | resident before [GB] | peak [GB] | of which votes [GB] | time [s] | share seen |
-|---|---|---|---|---|---|---|---|"""
-
-
-def measure(count: int, num_ids: int, views: int, size: int) -> dict[str, float]:
+def worker(*sizes: str) -> None:
+    """Print the figures of a vote as JSON; `sizes` are Gaussians, ids, views and pixels along a side."""
+    count, num_ids, views, size = map(int, sizes)
     gaussians, cameras, masks = large_scene(count, views, size, num_ids)
-    before = _peak()
-    start = time.perf_counter()
-    labels = jax.block_until_ready(lift_masks(gaussians, cameras, masks, num_ids=num_ids))
-    seconds = time.perf_counter() - start
-    seen = float(np.mean(np.asarray(labels.object_id) >= 0))
-    return {"before": before, "peak": _peak(), "votes": labels.votes.nbytes / 1e9, "seconds": seconds, "seen": seen}
-
-
-def _peak() -> float:
-    """Largest resident memory of this process so far [GB]."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
-
-
-if __name__ == "__main__":
-    print(json.dumps(measure(*map(int, sys.argv[1:]))))
+    before = peak_memory()
+    seconds, labels = clock(lambda: lift_masks(gaussians, cameras, masks, num_ids=num_ids))
+    figures = {"before": before, "peak": peak_memory(), "votes": labels.votes.nbytes / 1e9, "seconds": seconds}
+    print(json.dumps({**figures, "seen": float(np.mean(np.asarray(labels.object_id) >= 0))}))

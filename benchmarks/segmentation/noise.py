@@ -1,17 +1,15 @@
-"""How much wrong the masks may be: what the vote makes of eroded, swapped, missing and salted ones."""
+"""Votes on masks that are eroded, swapped, missing or salted, by the amount."""
 
 from pathlib import Path
 
 import jax.numpy as jnp
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from benchmarks.common.pages import picture, table
+from benchmarks.segmentation.tabletop import TABLE, Tabletop, mean_scores, scores_by_object
 from pigjax.segmentation import Labels, fill_unseen, lift_masks
-from segmentation.tabletop import TABLE, Tabletop, mean_scores, scores_by_object
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 WEIGHTINGS = ("centre", "alpha")
 PLOT = "segmentation_noise.png"
@@ -43,7 +41,7 @@ def dropped(masks, percent: float, rng) -> np.ndarray:
     """This share of the views without masks.
 
     With background = "ignore" the background has a say only where no object has a vote, so a view of background is no
-    view: all shapes stay the same, and nothing compiles anew.
+    view: all shapes stay the same, and nothing is recompiled.
     """
     result = masks.copy()
     result[rng.permutation(len(masks))[: round(len(masks) * percent / 100)]] = 0
@@ -64,17 +62,14 @@ NOISES = {
 }
 
 
-def study(scene: Tabletop, folder: Path) -> str:
-    """A table in Markdown, and its plot in `folder`.
+def study(scene: Tabletop, options) -> str:
+    """A table in Markdown, and its plot.
 
     Right is the share of Gaussians with their true id as the vote gives it; for mIoU on the test views (objects drawn
     alone, mean without the table) the unlabelled ones take the id of their neighbours.
     """
     assert scene.truth is not None
-    rows = [
-        "| noise | amount | right, centre | right, alpha | mIoU, centre | mIoU, alpha |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = []
     clean = np.asarray(scene.train.masks)
     results: dict[bytes, tuple[float, float]] = {}
     curves = {}
@@ -88,17 +83,19 @@ def study(scene: Tabletop, folder: Path) -> str:
                     results[key] = _score(scene, masks, weighting)
                 scores.append(results[key])
             (right, iou), (alpha_right, alpha_iou) = scores[-2:]
-            rows.append(f"| {name} | {amount} | {right:.4f} | {alpha_right:.4f} | {iou:.1f} | {alpha_iou:.1f} |")
+            numbers = f"{right:.4f}", f"{alpha_right:.4f}", f"{iou:.1f}", f"{alpha_iou:.1f}"
+            rows.append([name, amount, *numbers])
         curves[name] = amounts, np.reshape(scores, (len(amounts), 2, 2))
-    _plot(curves, folder / PLOT)
-    return "\n".join(rows)
+    _plot(curves, options.media / PLOT)
+    columns = ["noise", "amount", "right, centre", "right, alpha", "mIoU, centre", "mIoU, alpha"]
+    return f"{table(columns, rows)}\n\n{picture(PLOT, 'accuracy against noise')}"
 
 
 def _score(scene: Tabletop, masks, weighting: str) -> tuple[float, float]:
     """Share of Gaussians right, and mIoU [%] on the test views."""
     labels = lift_masks(scene.gaussians, scene.train.cameras, masks, num_ids=scene.num_ids, weighting=weighting)
     found = np.asarray(labels.object_id)
-    # everything in this scene is an object: background is what no mask spoke of
+    # everything in this scene is an object: background are the Gaussians without a mask
     unlabelled = Labels(jnp.asarray(np.where(found > 0, found, -1)), labels.votes, labels.confidence)
     filled = fill_unseen(scene.gaussians, unlabelled)
     objects = [number for number in scene.names if number not in (0, TABLE)]

@@ -1,24 +1,21 @@
-"""What thresholds, views and resolution do to a vote, and gradient descent on the thresholds from a bad start."""
+"""Votes by thresholds, views and resolution, and gradient descent on the thresholds from a bad start."""
 
-import statistics
-import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import optax
 from jax.scipy.special import logit
 
+from benchmarks.common.pages import head, picture, row
+from benchmarks.common.timing import frames_of, timed
+from benchmarks.segmentation.tabletop import Tabletop
 from pigjax.segmentation import enough_capacity, lift_masks
 from pigjax.splat import RenderConfig
-from segmentation.tabletop import Tabletop
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 PLOT = "segmentation_sweep.png"
 TAU_T = (0.05, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95)
@@ -36,23 +33,24 @@ class Descent(NamedTuple):
     right_after: float
 
 
-def study(scene: Tabletop, folder: Path) -> str:
-    """Tables in Markdown and one plot in `folder`: share of Gaussians with their true id; unseen ones are wrong."""
+def study(scene: Tabletop, options) -> str:
+    """Prints tables, and draws one plot: share of Gaussians with their true id; unseen ones are wrong."""
     thresholds = sweep_thresholds(scene)
-    rows = ["| tau_T \\ tau_d | " + " | ".join(f"{value:g}" for value in TAU_D) + " |", "|---" * (len(TAU_D) + 1) + "|"]
-    rows += [f"| {tau_T:g} | " + " | ".join(f"{v:.4f}" for v in line) + " |" for tau_T, line in zip(TAU_T, thresholds)]
+    print(head("tau_T \\ tau_d", *(f"{value:g}" for value in TAU_D)))
+    for tau_T, line in zip(TAU_T, thresholds):
+        print(row(f"{tau_T:g}", *(f"{value:.4f}" for value in line)))
     views = sweep_views(scene)
-    rows += ["", "| views | pixels | right | time [s] | ms a view |", "|---|---|---|---|---|"]
+    print("\n" + head("views", "pixels", "right", "time [s]", "ms a view"))
     for (count, size), (right, seconds) in views.items():
-        rows.append(f"| {count} | {size}² | {right:.4f} | {seconds:.2f} | {1e3 * seconds / count:.0f} |")
-    rows += ["", "| from (tau_T, tau_d) | right | to | right | loss | time [s] |", "|---|---|---|---|---|---|"]
+        print(row(count, f"{size}²", f"{right:.4f}", f"{seconds:.2f}", f"{1e3 * seconds / count:.0f}"))
+    print("\n" + head("from (tau_T, tau_d)", "right", "to", "right", "loss", "time [s]"))
     paths = descend(scene, BAD_STARTS)
     for path in paths:
         (a, b), (c, d) = path.taus[0], path.taus[-1]
-        ends = f"{a:.3g}, {b:.3g} | {path.right_before:.4f} | {c:.3g}, {d:.3g} | {path.right_after:.4f}"
-        rows.append(f"| {ends} | {path.losses[0]:.3f} → {path.losses[-1]:.3f} | {path.seconds:.0f} |")
-    _plot(thresholds, views, paths, folder / PLOT)
-    return "\n".join(rows)
+        ends = f"{a:.3g}, {b:.3g}", f"{path.right_before:.4f}", f"{c:.3g}, {d:.3g}", f"{path.right_after:.4f}"
+        print(row(*ends, f"{path.losses[0]:.3f} → {path.losses[-1]:.3f}", f"{path.seconds:.0f}"))
+    _plot(thresholds, views, paths, options.media / PLOT)
+    return "\n" + picture(PLOT, "thresholds, views and resolution")
 
 
 def sweep_thresholds(scene: Tabletop) -> np.ndarray:
@@ -71,21 +69,15 @@ def sweep_views(scene: Tabletop) -> dict[tuple[int, int], tuple[float, float]]:
     """Share right and warm seconds by number of views and by pixels along a side."""
     results = {}
     for size in SIZES:
-        pixel = (np.arange(size) * 2 + 1) * scene.train.masks.shape[1] // (2 * size)
         for every in EVERY:
-            train = scene.train[::every]
-            cameras, masks = train.cameras.resized(size, size), train.masks[:, pixel[:, None], pixel]
+            cameras, masks = scene.seen(size, every)
 
             def lift(cameras=cameras, masks=masks):
                 labels = lift_masks(scene.gaussians, cameras, masks, num_ids=scene.num_ids)
                 return np.asarray(labels.object_id)
 
-            found, seconds = lift(), []
-            for _ in range(3):
-                begun = time.perf_counter()
-                lift()
-                seconds.append(time.perf_counter() - begun)
-            results[len(masks), size] = float(np.mean(found == scene.truth)), statistics.median(seconds)
+            run = timed(lift, windows=3)
+            results[len(masks), size] = float(np.mean(run.result == scene.truth)), run.seconds
     return results
 
 
@@ -95,9 +87,7 @@ def descend(scene: Tabletop, starts: Iterable[tuple[float, float]], size: int = 
     The loss is the mean -log of the share of its soft votes that a Gaussian gives its true id, with a twentieth of a
     vote for every id, so that Gaussians without votes cost log(num_ids). Eight views of `size`² pixels.
     """
-    train = scene.train[::4]
-    pixel = (np.arange(size) * 2 + 1) * train.masks.shape[1] // (2 * size)
-    cameras, masks = train.cameras.resized(size, size), train.masks[:, pixel[:, None], pixel]
+    cameras, masks = scene.seen(size, every=4)
     config = enough_capacity(scene.gaussians, cameras, RenderConfig())
     rows = jnp.arange(len(scene.gaussians))
     optimizer = optax.adam(RATE)
@@ -116,15 +106,11 @@ def descend(scene: Tabletop, starts: Iterable[tuple[float, float]], size: int = 
         return optax.apply_updates(logits, updates), state, value
 
     def from_(start):
-        logits = logit(jnp.array(start))
-        state, taus, losses = optimizer.init(logits), [start], []
-        begun = time.perf_counter()
-        for _ in range(STEPS):
-            logits, state, value = step(logits, state)
-            taus.append(tuple(jax.nn.sigmoid(logits).tolist()))
-            losses.append(float(value))
-        spent = time.perf_counter() - begun
-        return Descent(taus, losses, spent, _right(scene, *taus[0]), _right(scene, *taus[-1]))
+        first = logit(jnp.array(start))
+        run = frames_of(lambda now: step(*now[:2]), (first, optimizer.init(first)), STEPS)
+        taus = [start, *(tuple(jax.nn.sigmoid(logits).tolist()) for logits, *_ in run.result[1:])]
+        losses = [float(value) for *_, value in run.result[1:]]
+        return Descent(taus, losses, sum(run.windows), _right(scene, *taus[0]), _right(scene, *taus[-1]))
 
     step(logit(jnp.array([0.5, 0.5])), optimizer.init(jnp.zeros(2)))  # compiles, outside the times
     return list(map(from_, starts))

@@ -7,14 +7,14 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.common.pages import ROOT, TABLETOP
+from pigjax.core.gaussians import SH_CONSTANT
 from pigjax.core.metrics import score_masks
 from pigjax.io import Views, load_ply, load_views, read_json
 from pigjax.segmentation import Labels, enough_capacity, object_mask
 from pigjax.splat import Gaussians, RenderConfig
 
-ROOT = Path(__file__).parents[2]
-EXAMPLE = ROOT / "examples/tabletop"
-TABLE = 1  # its own mask is what the other objects leave of it
+TABLE = 1  # its mask excludes the other objects
 
 
 class Tabletop(NamedTuple):
@@ -28,6 +28,12 @@ class Tabletop(NamedTuple):
     def num_ids(self) -> int:
         return max(self.names) + 1
 
+    def seen(self, size: int, every: int = 1, start: int = 0):
+        """Cameras and masks of some training views, with so many pixels along a side."""
+        train = self.train[start::every]
+        pixel = (np.arange(size) * 2 + 1) * train.masks.shape[1] // (2 * size)
+        return train.cameras.resized(size, size), train.masks[:, pixel[:, None], pixel]
+
 
 def load_tabletop(folder: Path | None = None) -> Tabletop:
     """Cloud on the depth maps and its views; without `folder` the bundled views and the cloud in tests/data."""
@@ -35,7 +41,7 @@ def load_tabletop(folder: Path | None = None) -> Tabletop:
         cloud, truth = _bundled_cloud()
     else:
         cloud, truth = load_ply(folder / "points.ply"), np.load(folder / "points.ids.npy")
-    folder = folder or EXAMPLE
+    folder = folder or TABLETOP
     train, test = (load_views(folder, masks=True, split=split) for split in ("train", "test"))
     names = {int(number): str(name) for number, name in read_json(folder / "names.json").items()}
     return Tabletop(cloud, truth, train, test, names)
@@ -52,7 +58,7 @@ def _bundled_cloud() -> tuple[Gaussians, np.ndarray]:
         np.repeat(np.asarray(log_scales, np.float32)[:, None], 3, 1),
         np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
         np.full(count, data["logit_opacity"], np.float32),
-        np.asarray((data["colours"][:, None] / 255 - 0.5) / 0.28209479177387814, np.float32),
+        np.asarray((data["colours"][:, None] / 255 - 0.5) / SH_CONSTANT, np.float32),
     )
     return gaussians, data["object_id"]
 

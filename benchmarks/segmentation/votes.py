@@ -1,15 +1,16 @@
 """Every kind of vote on the cloud with known ids: share right beside time, in units of drawing the views' depth."""
 
-import statistics
-import time
+from functools import partial
 
 import jax
 import numpy as np
 from jax import lax
 
+from benchmarks.common.pages import head, row
+from benchmarks.common.timing import in_turn
+from benchmarks.segmentation.tabletop import Tabletop
 from pigjax.segmentation import enough_capacity, fill_unseen, lift_masks
 from pigjax.splat import RenderConfig, surface_depth
-from segmentation.tabletop import Tabletop
 
 KINDS = {
     "paper's thresholds, ties by alpha·T": {},
@@ -21,43 +22,25 @@ KINDS = {
 }
 
 
-def study(scene: Tabletop, repeats: int = 5) -> str:
-    """A table in Markdown; each kind is timed in turn with the depth of the same views, medians of warm calls."""
+def study(scene: Tabletop, _) -> None:
+    """Prints a table; each kind is timed in turn with the depth of the same views."""
     gaussians, train = scene.gaussians, scene.train
     config = enough_capacity(gaussians, train.cameras, RenderConfig())
     depths = jax.jit(lambda scene, cameras: lax.map(lambda camera: surface_depth(scene, camera, config), cameras))
 
-    def draw():
-        return jax.block_until_ready(depths(gaussians, train.cameras))
-
-    rows = ["| vote | right | unseen | right, unseen filled | time [s] | of drawing the depth | first call [s] |"]
-    rows += ["|---|---|---|---|---|---|---|"]
+    print(head("vote", "right", "unseen", "right, unseen filled", "time [s]", "of drawing the depth", "compile [s]"))
     for name, settings in KINDS.items():
-
-        def lift(settings=settings):
-            return jax.block_until_ready(
-                lift_masks(gaussians, train.cameras, train.masks, num_ids=scene.num_ids, **settings)
-            )
-
-        _, first = _timed(lift)
-        draw()
-        pairs = [(_timed(draw)[1], _timed(lift)) for _ in range(repeats)]
-        ratio = statistics.median(seconds / depth for depth, (_, seconds) in pairs)
-        seconds = statistics.median(seconds for _, (_, seconds) in pairs)
-        labels = pairs[0][1][0]
+        runs = {
+            "depth": partial(depths, gaussians, train.cameras),
+            "vote": partial(lift_masks, gaussians, train.cameras, train.masks, num_ids=scene.num_ids, **settings),
+        }
+        depth, vote = in_turn(runs, windows=5).values()
+        labels = vote.result
         right, filled = (_right(scene, found) for found in (labels, fill_unseen(gaussians, labels)))
         unseen = np.mean(np.asarray(labels.object_id) < 0)
-        rows.append(
-            f"| {name} | {right:.4f} | {unseen:.4f} | {filled:.4f} | {seconds:.2f} | {ratio:.2f} | {first:.1f} |"
-        )
-    return "\n".join(rows)
+        times = f"{vote.seconds:.2f}", f"{vote.over(depth):.2f}", f"{vote.compile_seconds:.1f}"
+        print(row(name, f"{right:.4f}", f"{unseen:.4f}", f"{filled:.4f}", *times))
 
 
 def _right(scene: Tabletop, labels) -> float:
     return float(np.mean(np.asarray(labels.object_id) == scene.truth))
-
-
-def _timed(call):
-    begun = time.perf_counter()
-    result = call()
-    return result, time.perf_counter() - begun

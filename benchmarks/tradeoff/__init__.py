@@ -1,1 +1,1 @@
-"""Error against time over every knob, one module per stage; `bench_tradeoff.py` prints docs/TRADEOFF.md."""
+"""Error against time over every knob, one module per stage."""

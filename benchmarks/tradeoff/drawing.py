@@ -1,18 +1,18 @@
 """Drawing: the last frame of each scene against the exact setting in float64, over the renderer's knobs."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.common.timing import in_turn
+from benchmarks.tradeoff.errors import enlarged, root_mean_square, video_psnr
+from benchmarks.tradeoff.points import Point, by_scene
+from benchmarks.tradeoff.scenes import as_float64, picture, pose, simulate, source
 from pigjax import prune
 from pigjax.scene.plan import make_cameras
 from pigjax.splat import RenderConfig, required_capacity
-from tradeoff.errors import enlarged, root_mean_square, video_psnr
-from tradeoff.points import Point, in_turn, plot, table
-from tradeoff.scenes import as_float64, picture, pose, simulate, source
 
 PLOT = "tradeoff_drawing.png"
 EXACT = {"alpha_min": 1e-6, "transmittance_min": 0.0}
@@ -30,18 +30,13 @@ CONFIGS = {
 SCALES, KEPT, ROOM = (0.75, 0.5), (0.75, 0.5), 0.8
 
 
-def study(folder: Path, scenes) -> str:
-    """Tables of all scenes, and one plot in `folder`."""
-    panels = {name: _study(name) for name in scenes}
-    text = []
-    for name, points in panels.items():
-        text += [f"**{name}**", table(points, error="RMS error of colour")]
-    plot(panels, folder / PLOT, error="RMS error of colour")
-    head = (
+def study(options) -> str:
+    """Tables of all scenes and one plot."""
+    print(
         "One picture of the deformed scene. Reference: the exact setting (alpha ≥ 1e-6, no early stop) in float64. Of a"
-        " smaller picture the error is that of the picture enlarged."
+        " smaller picture the error is that of the picture enlarged.\n"
     )
-    return "\n\n".join([head, *text, f"![error against time of drawing](media/{PLOT})"])
+    return by_scene(options, lambda name: (_study(name), None, ""), PLOT, error="RMS error of colour")
 
 
 def _study(name):

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import zoom
 
 
 class Displacement(NamedTuple):
@@ -10,13 +11,13 @@ class Displacement(NamedTuple):
 
     total: float
     centre: float  # of the centre of mass of each body
-    shape: float  # what is left without the centres
+    shape: float  # the rest, without the centres
 
 
 def distance_travelled(path) -> float:
     """Root mean square over points of the length of their path [t p 3], the start included.
 
-    What bounces ends near its start, so the distance between the two would measure nothing.
+    Matter that bounces ends near its start, so the distance between the two would measure nothing.
     """
     steps = np.linalg.norm(np.diff(np.asarray(path, np.float64), axis=0), axis=2)
     return float(np.sqrt(np.mean(steps.sum(0) ** 2)))
@@ -50,16 +51,8 @@ def root_mean_square(frames, reference) -> float:
 
 def enlarged(frames, size) -> np.ndarray:
     """Frames [t h w 3] at another size (h, w), linear between pixel centres, edges repeated."""
-    for axis, count in zip((1, 2), size):
-        old = frames.shape[axis]
-        if old == count:
-            continue
-        place = np.clip((np.arange(count) + 0.5) * old / count - 0.5, 0, old - 1)
-        low = np.minimum(place.astype(int), max(old - 2, 0))
-        high = np.minimum(low + 1, old - 1)
-        share = (place - low).reshape([-1 if a == axis else 1 for a in range(4)])
-        frames = (1 - share) * np.take(frames, low, axis) + share * np.take(frames, high, axis)
-    return frames
+    factors = [new / old for new, old in zip(size, frames.shape[1:3])]
+    return zoom(frames, (1, *factors, 1), order=1, mode="nearest", grid_mode=True)
 
 
 def share_right(found, truth) -> float:

@@ -1,15 +1,15 @@
 """Matter: displacement error of the Gaussians' particles against the finest grid, over the simulation's knobs."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from tradeoff.errors import displacement_error, distance_travelled
-from tradeoff.points import Point, in_turn, plot, table
-from tradeoff.scenes import as_float64, simulate, source, tracers
+from benchmarks.common.timing import in_turn
+from benchmarks.tradeoff.errors import displacement_error, distance_travelled
+from benchmarks.tradeoff.points import Point, by_scene
+from benchmarks.tradeoff.scenes import as_float64, simulate, source, tracers
 
 PLOT = "tradeoff_matter.png"
 KNOBS = {
@@ -36,15 +36,9 @@ KNOBS["sand"] = KNOBS["elastic"]
 COARSER = {"elastic": "dx / 1.4", "sand": "dx / 1.4", "tabletop": "standard"}
 
 
-def study(folder: Path, scenes) -> str:
-    """Tables of all scenes, printed as they come, and one plot in `folder`."""
-    panels, floors = {}, {}
-    for name in scenes:
-        jax.clear_caches()  # compiled programs are mapped into memory piece by piece, and the pieces have a limit
-        panels[name], floors[name], said = _study(name)
-        print(f"**{name}**\n\n{said}\n\n{table(panels[name], error='error of the distance travelled')}\n")
-    plot(panels, folder / PLOT, error="displacement error (share of the distance)", floors=floors)
-    return f"![error against time of matter](media/{PLOT})"
+def study(options) -> str:
+    """Tables of all scenes and one plot."""
+    return by_scene(options, _study, PLOT, error="error of displacement (share of the distance travelled)")
 
 
 def _study(name):
@@ -59,9 +53,9 @@ def _study(name):
     timed = in_turn(runs, windows=3 if name != "tabletop" else 1)
     count = len(of.inputs.gaussians)
     ends = {key: _of_gaussians(plans.get(key, plans["standard"]), timed[key].result[-1], count) for key in settings}
-    finest, way = plans["reference"], np.asarray(timed["reference"].result)
+    finest, path = plans["reference"], np.asarray(timed["reference"].result)
     rows, _ = tracers(finest, count)
-    travelled = distance_travelled(np.concatenate([np.asarray(finest.particles.x)[None, rows], way[:, rows]]))
+    travelled = distance_travelled(np.concatenate([np.asarray(finest.particles.x)[None, rows], path[:, rows]]))
     body = np.asarray(of.labels.object_id)
 
     def error(x, reference):

@@ -1,17 +1,17 @@
-"""Settings measured beside each other: warm medians in turn, the Pareto set, a table and a plot."""
+"""Settings measured beside each other: the Pareto set, a table and a plot."""
 
-import statistics
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 from matplotlib.figure import Figure
 
+from benchmarks.common.pages import head, picture, row
+
 
 class Point(NamedTuple):
-    """One setting: what it takes and how wrong it is."""
+    """One setting: its time and its error."""
 
     name: str
     knob: str  # that differs from the standard
@@ -19,30 +19,6 @@ class Point(NamedTuple):
     error: float  # smaller is better
     compile_seconds: float = float("nan")  # first run, less a warm one
     note: str = ""
-
-
-class Timed(NamedTuple):
-    seconds: float
-    compile_seconds: float
-    result: Any
-
-
-def in_turn(runs: dict[str, Callable[[], Any]], windows: int = 3) -> dict[str, Timed]:
-    """Each run once to compile, then all of them in turn `windows` times, so that all meet the same machine."""
-    first, results, times = {}, {}, {name: [] for name in runs}
-    for name, run in runs.items():
-        first[name], results[name] = _clock(run)
-    for _ in range(windows):
-        for name, run in runs.items():
-            times[name].append(_clock(run)[0])
-    medians = {name: statistics.median(values) for name, values in times.items()}
-    return {name: Timed(medians[name], max(first[name] - medians[name], 0.0), results[name]) for name in runs}
-
-
-def _clock(run):
-    begun = time.perf_counter()
-    result = jax.block_until_ready(run())
-    return time.perf_counter() - begun, result
 
 
 def pareto(points: Sequence[Point]) -> set[str]:
@@ -56,16 +32,25 @@ def pareto(points: Sequence[Point]) -> set[str]:
     return best
 
 
+def by_scene(options, study: Callable, file: str, *, error: str) -> str:
+    """Tables of all scenes, printed as they come, and one plot; `study(name)` gives points, floor or None, and text."""
+    panels, floors = {}, {}
+    for name in options.scenes:
+        jax.clear_caches()  # compiled programs are mapped into memory piece by piece, and the pieces have a limit
+        panels[name], floors[name], said = study(name)
+        print("\n\n".join(text for text in (f"**{name}**", said, table(panels[name], error=error)) if text) + "\n")
+    plot(panels, options.media / file, error=error, floors={name: floor for name, floor in floors.items() if floor})
+    return picture(file, "error against time")
+
+
 def table(points: Sequence[Point], *, error: str, show: Callable[[float], str] = "{:.2e}".format) -> str:
     """Markdown, fastest first, members of the Pareto set in bold."""
     best = pareto(points)
-    rows = [f"| setting | knob | time [s] | {error} | compile [s] | |", "|---|---|---|---|---|---|"]
+    rows = [head("setting", "knob", "time [s]", error, "compile [s]", "")]
     for point in sorted(points, key=lambda p: p.seconds):
         name = f"**{point.name}**" if point.name in best else point.name
         compiled = "" if point.compile_seconds != point.compile_seconds else f"{point.compile_seconds:.1f}"
-        rows.append(
-            f"| {name} | {point.knob} | {point.seconds:.3g} | {show(point.error)} | {compiled} | {point.note} |"
-        )
+        rows.append(row(name, point.knob, f"{point.seconds:.3g}", show(point.error), compiled, point.note))
     return "\n".join(rows)
 
 

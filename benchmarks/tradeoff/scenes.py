@@ -1,4 +1,4 @@
-"""The bundled tabletop, a jelly cube and a cube of sand made here, and their way to pictures, stage by stage."""
+"""The bundled tabletop, a jelly cube and a cube of sand made here, and their pipeline to pictures, stage by stage."""
 
 import tempfile
 import tomllib
@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.common.pages import TABLETOP
 from pigjax import Gaussians, save_ply
 from pigjax.core.camera import Camera
 from pigjax.coupling.binding import deform
@@ -22,12 +23,11 @@ from pigjax.scene.schema import Scene
 from pigjax.segmentation import Labels
 from pigjax.splat import RenderConfig, Splats, render
 
-EXAMPLE = Path(__file__).parents[2] / "examples/tabletop"
 SIDE, HEIGHT = 0.2, 0.24  # of the cube, and of its middle above the floor [m]
 
 
 class Source(NamedTuple):
-    """A scene file's values, what it reads, and its labels: the same for every setting."""
+    """A scene file's values, its inputs, and its labels: the same for every setting."""
 
     name: str
     values: dict[str, Any]
@@ -48,7 +48,7 @@ class Source(NamedTuple):
 def source(name: str) -> Source:
     """One of SCENES."""
     if name == "tabletop":
-        values, folder = tomllib.loads((EXAMPLE / "scene.toml").read_text()), EXAMPLE
+        values, folder = tomllib.loads((TABLETOP / "scene.toml").read_text()), TABLETOP
         values["simulation"] |= {"frames": 12}
     else:
         folder = Path(tempfile.mkdtemp())

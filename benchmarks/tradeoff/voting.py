@@ -1,16 +1,17 @@
-"""Voting: share of Gaussians with their true id, over views, resolution of depth and the way of counting."""
+"""Voting: share of Gaussians with their true id, over views, resolution of depth and kind of vote."""
 
 import statistics
-from pathlib import Path
 
 import jax
 import numpy as np
-from segmentation.tabletop import load_tabletop
 
+from benchmarks.common.pages import picture
+from benchmarks.common.timing import in_turn
+from benchmarks.segmentation.tabletop import load_tabletop
+from benchmarks.tradeoff.errors import share_right
+from benchmarks.tradeoff.points import Point, plot, table
 from pigjax.segmentation import enough_capacity, lift_masks
 from pigjax.splat import RenderConfig
-from tradeoff.errors import share_right
-from tradeoff.points import Point, in_turn, plot, table
 
 PLOT = "tradeoff_voting.png"
 STANDARD = {"every": 1, "size": 256}
@@ -27,35 +28,32 @@ SETTINGS = {
 }
 
 
-def study(folder: Path, scenes) -> str:
-    """Table and a plot in `folder`; only the tabletop has more than one object."""
-    if "tabletop" not in scenes:
+def study(options) -> str:
+    """Table and a plot; only the tabletop has more than one object."""
+    if "tabletop" not in options.scenes:
         return "Only the tabletop has several objects to tell apart."
     scene = load_tabletop()
     runs = {name: _vote(scene, **STANDARD | fields) for name, (_, fields) in SETTINGS.items()}
     points = []
-    for name, timed in in_turn(runs).items():
+    for name, timed in in_turn(runs, windows=3).items():
         found = np.asarray(timed.result)
         right = share_right(found, scene.truth)
         note = f"{100 * right:.2f} % right, {100 * np.mean(found < 0):.2f} % never seen"
         points.append(Point(name, SETTINGS[name][0], timed.seconds, 1 - right, timed.compile_seconds, note))
     spread = _spread(scene)
-    plot({"tabletop": points}, folder / PLOT, error="share of wrong ids")
+    plot({"tabletop": points}, options.media / PLOT, error="share of wrong ids")
     head = (
         f"{len(scene.truth)} Gaussians with known ids, {len(scene.train)} views. Reference: the truth. Which views"
         f" they are moves the share of 8 views by {spread:.1e} (standard deviation over four disjoint sets). The small"
         " scenes have one object each, so nothing to vote on."
     )
     return "\n\n".join(
-        [head, table(points, error="share wrong", show="{:.4f}".format), f"![error against time](media/{PLOT})"]
+        [head, table(points, error="share wrong", show="{:.4f}".format), picture(PLOT, "error against time")]
     )
 
 
 def _vote(scene, every, size, start=0, **options):
-    train = scene.train[start::every]
-    pixel = (np.arange(size) * 2 + 1) * scene.train.masks.shape[1] // (2 * size)
-    cameras, masks = train.cameras.resized(size, size), train.masks[:, pixel[:, None], pixel]
-    gaussians = scene.gaussians
+    gaussians, (cameras, masks) = scene.gaussians, scene.seen(size, every, start)
     config = enough_capacity(gaussians, cameras, RenderConfig())
     vote = jax.jit(
         lambda gaussians, cameras: (

@@ -1,13 +1,11 @@
 """The whole pipeline: the video's error against the reference's, for the levels of `accuracy` and for single knobs."""
 
-from pathlib import Path
-
-import jax
 import numpy as np
 
-from tradeoff.errors import root_mean_square, video_psnr
-from tradeoff.points import Point, in_turn, plot, table
-from tradeoff.scenes import draw, simulate, source
+from benchmarks.common.timing import in_turn
+from benchmarks.tradeoff.errors import root_mean_square, video_psnr
+from benchmarks.tradeoff.points import Point, by_scene
+from benchmarks.tradeoff.scenes import draw, simulate, source
 
 PLOT = "tradeoff_whole.png"
 LEVELS = ("draft", "standard", "reference")
@@ -19,19 +17,13 @@ KNOBS = {
 SEED = {"simulation": {"seed": 1}}
 
 
-def study(folder: Path, scenes) -> str:
-    """Tables of all scenes, printed as they come, and one plot in `folder`."""
+def study(options) -> str:
+    """Tables of all scenes, printed as they come, and one plot."""
     print(
         "Seeding, simulating and drawing; reading and voting are the same for all. Error: all frames against those of"
         ' accuracy = "reference", smaller ones enlarged.\n'
     )
-    panels, floors = {}, {}
-    for name in scenes:
-        jax.clear_caches()  # compiled programs are mapped into memory piece by piece, and the pieces have a limit
-        panels[name], floors[name], said = _study(name)
-        print(f"**{name}**\n\n{said}\n\n{table(panels[name], error='RMS error of colour')}\n")
-    plot(panels, folder / PLOT, error="RMS error of colour in the video", floors=floors)
-    return f"![error against time of the whole pipeline](media/{PLOT})"
+    return by_scene(options, _study, PLOT, error="RMS error of colour in the video")
 
 
 def _study(name):

@@ -8,13 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import curve_fit
 
-from pigjax.mls_mpm import SimConfig, rollout
-from pigjax.mpm import Grid
-from pigjax.mpm.colliders import Plane
-from pigjax.mpm.contact import BodyContact
-from pigjax.mpm.timestep import stable_dt
-from verification.common import (
-    NO_GRAVITY,
+from benchmarks.verification.common import (
     Case,
     Row,
     elastic,
@@ -25,8 +19,14 @@ from verification.common import (
     nodes,
     particles,
     percent,
+    simulate,
     strain_energy,
 )
+from pigjax.mls_mpm import SimConfig
+from pigjax.mpm import Grid
+from pigjax.mpm.colliders import Plane
+from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.timestep import stable_dt
 
 RADIUS, CENTRES, THROWN = 0.2, (0.2, 0.8), 0.1  # [m], [m], [m/s] along x and y
 TOUCH = (0.6 * math.sqrt(2) - 2 * RADIUS) / (2 * THROWN * math.sqrt(2))  # [s]
@@ -47,18 +47,8 @@ def discs(cells, kernel="quadratic", contact=None, duration=3.6, frames=180):
     table = elastic(young=1000.0, poisson=0.3)
     p = particles(x, volume=dx**3 / 4, table=table, v=v, body=np.repeat([0, 1], half))
     grid = nodes(dx, cells + 13, cells + 13, 8, origin=[-6 * dx, -6 * dx, -3 * dx])
-    end, path, health = rollout(
-        p,
-        grid,
-        table,
-        SimConfig(kernel=kernel),
-        frames=frames,
-        frame_dt=duration / frames,
-        gravity=NO_GRAVITY,
-        colliders=held(2),
-        contact=contact,
-    )
-    health.raise_if_bad()
+    config, steps = SimConfig(kernel=kernel), {"frames": frames, "frame_dt": duration / frames}
+    end, path = simulate(p, grid, table, config, **steps, colliders=held(2), contact=contact)
     moving = kinetic(p.mass, path.v)
     stored = strain_energy(path.F_visual, p.volume0, table)
     start = kinetic(p.mass, p.v)
@@ -69,7 +59,7 @@ def discs(cells, kernel="quadratic", contact=None, duration=3.6, frames=180):
 
 
 def parting(t, approach):
-    """When the discs have no force on each other any more [s], and what parting took of their speed, as a share."""
+    """When the discs have no force on each other any more [s], and the share of their speed that parting took."""
     pulled = np.flatnonzero(np.abs(approach - approach[-1]) > 1e-3)[-1]
     return t[pulled + 1], approach[-1] - approach.min()
 
@@ -79,10 +69,10 @@ def two_discs():
     diagonal with 0.1 m/s a component (Sulsky, Chen and Schreyer 1994, doi 10.1016/0045-7825(94)90112-0).
 
     In the single field bodies meet on the grid, so they feel each other about a cell before they touch, and pull on
-    each other as they part: `pull` is what that takes of the speed of separation. With `BodyContact` they meet within a
-    cell of where they touch (the row counts from a loss of 1 % of the speed), part earlier, and nothing pulls. The
-    energy that the centres of mass lose is physical in part: it stays in the discs as vibration, of which APIC then
-    damps what the grid cannot resolve. `energy kept` is kinetic and strain energy together at 3.6 s.
+    each other as they part: `pull` is the share of the speed of separation that this takes. With `BodyContact` they
+    meet within a cell of where they touch (the row counts from a loss of 1 % of the speed), part earlier, and nothing
+    pulls. The energy that the centres of mass lose is physical in part: it stays in the discs as vibration, of which
+    APIC then damps the part that the grid cannot resolve. `energy kept` is kinetic and strain energy together at 3.6 s.
     """
     rows, series = [], {}
     apart = BodyContact(bodies=2)
@@ -107,8 +97,8 @@ def two_discs():
         left, right = figure.subplots(1, 2)
         for (cells, contact), line in (((80, False), "-"), ((80, True), "--"), ((20, False), ":")):
             t, moving, stored, _ = series["quadratic", cells, contact]
-            for k, (values, what) in enumerate(((moving, "kinetic"), (stored, "strain"), (moving + stored, "total"))):
-                left.plot(t, values, line, color=f"C{k}", label=f"{what}, 1/{cells} m{', contact' * contact}")
+            for k, (values, kind) in enumerate(((moving, "kinetic"), (stored, "strain"), (moving + stored, "total"))):
+                left.plot(t, values, line, color=f"C{k}", label=f"{kind}, 1/{cells} m{', contact' * contact}")
         left.axvline(TOUCH, color="0.7")
         left.set(xlabel="t [s]", ylabel="share of the energy at the start")
         left.legend(fontsize=5)
@@ -136,28 +126,19 @@ def sag(cells, slender=8, periods=1.25):
     gravity = 0.01 * long / per_gravity
     first = 2 * math.pi / 1.8751**2 * math.sqrt(12 * density / young) * long**2 / thick  # period [s]
     frames = 100
-    _, path, health = rollout(
-        p,
-        grid,
-        table,
-        SimConfig(walls="sticky"),
-        frames=frames,
-        frame_dt=periods * first / frames,
-        gravity=(0.0, -gravity, 0.0),
-        colliders=held(2),
-    )
-    health.raise_if_bad()
+    config, steps = SimConfig(walls="sticky"), {"frames": frames, "frame_dt": periods * first / frames}
+    _, path = simulate(p, grid, table, config, **steps, gravity=(0.0, -gravity, 0.0), colliders=held(2))
     tip = x[:, 0] > x[:, 0].max() - 0.01 * dx
-    way = x[tip, 1].mean() - np.asarray(path.x[:, tip, 1].mean(1))
+    fallen = x[tip, 1].mean() - np.asarray(path.x[:, tip, 1].mean(1))
     # the last particles stand a quarter cell before the end, where the beam is straight: slope ρ g A L³ / 6 E I
-    way = way + dx / 4 * density * gravity * thick * long**3 / (6 * young * thick**3 / 12)
+    fallen = fallen + dx / 4 * density * gravity * thick * long**3 / (6 * young * thick**3 / 12)
     t = periods * np.arange(1, frames + 1) / frames
 
     def swing(t, mean, amplitude, frequency, damping):
         return mean - amplitude * np.exp(-damping * t) * np.cos(2 * np.pi * frequency * t)
 
-    (mean, _, frequency, _), _ = curve_fit(swing, t, way / (0.01 * long), (1.0, 1.0, 1.0, 0.0))
-    return mean, 1 / frequency, t, way / (0.01 * long)
+    (mean, _, frequency, _), _ = curve_fit(swing, t, fallen / (0.01 * long), (1.0, 1.0, 1.0, 0.0))
+    return mean, 1 / frequency, t, fallen / (0.01 * long)
 
 
 @in_float64
@@ -169,20 +150,20 @@ def cantilever():
     """
     rows, series = [], []
     for cells in (2, 4, 8):
-        mean, period, t, way = sag(cells)
-        series.append((cells, t, way))
+        mean, period, t, fallen = sag(cells)
+        series.append((cells, t, fallen))
         name = f"cantilever, {cells} cells thick"
         rows.append(Row(name, "Timoshenko's sag", "1", f"{mean:.4f}", percent(mean - 1)))
         rows.append(Row(f"{name}: period", "2π/1.875² √(ρA/EI) L²", "1", f"{period:.4f}", percent(period - 1)))
 
     def draw(figure):
         axes = figure.subplots()
-        for cells, t, way in series:
-            axes.plot(t, way, label=f"{cells} cells thick")
+        for cells, t, fallen in series:
+            axes.plot(t, fallen, label=f"{cells} cells thick")
         exact = np.linspace(0, 1.25, 200)
         axes.plot(exact, 1 - np.cos(2 * np.pi * exact), "k:", label="closed form, first mode")
         axes.axhline(1, color="0.7")
-        axes.set(xlabel="t / first period", ylabel="tip's way / static sag")
+        axes.set(xlabel="t / first period", ylabel="tip's displacement / static sag")
         axes.legend()
 
     return Case(rows, draw)
@@ -213,17 +194,9 @@ def modulus(cells, *, axes, strain=0.005, transits=10):
         plates.append(Plane((1 - 1e-4 * dx) * normal, -normal, mode="slip", velocity=closing))
     colliders = (*plates, *held(*[k for k in range(3) if k not in axes]))
     substeps = math.ceil(duration / frames / float(stable_dt(table, grid, max_speed=strain / duration)))
-    _, path, health = rollout(
-        p,
-        grid,
-        table,
-        SimConfig(substeps=substeps),
-        frames=frames,
-        frame_dt=duration / frames,
-        gravity=NO_GRAVITY,
-        colliders=colliders,
+    _, path = simulate(
+        p, grid, table, SimConfig(substeps=substeps), frames=frames, frame_dt=duration / frames, colliders=colliders
     )
-    health.raise_if_bad()
     F = np.asarray(path.F_visual, float)
     J = np.linalg.det(F)
     mean = float(m.lam) * np.log(J)[..., None, None] * np.eye(3)
@@ -248,10 +221,9 @@ def plates():
         for cells in sizes:
             ours, exact = modulus(cells, axes=axes)
             errors.append(ours / exact - 1)
-            what = "uniaxial" if axes == (2,) else "hydrostatic"
-            rows.append(
-                Row(f"plates, {what}, {cells} cells", name, f"{exact:.5g} Pa", f"{ours:.5g} Pa", percent(errors[-1]))
-            )
+            kind = "uniaxial" if axes == (2,) else "hydrostatic"
+            figures = f"{exact:.5g} Pa", f"{ours:.5g} Pa", percent(errors[-1])
+            rows.append(Row(f"plates, {kind}, {cells} cells", name, *figures))
         series[name] = sizes, errors
 
     def draw(figure):

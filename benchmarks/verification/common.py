@@ -1,4 +1,4 @@
-"""What the cases share: rows, bodies in one, two and three dimensions, energies, and orders of convergence."""
+"""Shared by the cases: rows, bodies in one, two and three dimensions, energies, and orders of convergence."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pigjax.mls_mpm import rollout
 from pigjax.mpm import Grid, make_particles
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.materials import Material, material_table
@@ -29,7 +30,7 @@ class Row(NamedTuple):
 
 
 class Case(NamedTuple):
-    """What a case found, and its drawing: `draw(figure)` fills a matplotlib figure."""
+    """Rows of a case, and its drawing: `draw(figure)` fills a matplotlib figure."""
 
     rows: list[Row]
     draw: Callable[[Any], None] | None = None
@@ -69,6 +70,15 @@ def particles(x, *, volume, table, v=None, C=None, F=None, body=0):
     return made
 
 
+def simulate(p, grid, table, config, *, frames, frame_dt, gravity=NO_GRAVITY, colliders=(), contact=None):
+    """Last state and path of a healthy rollout."""
+    end, path, health = rollout(
+        p, grid, table, config, frames=frames, frame_dt=frame_dt, gravity=gravity, colliders=colliders, contact=contact
+    )
+    health.raise_if_bad()
+    return end, path
+
+
 def kinetic(mass, v):
     """Kinetic energy of the particles [J]."""
     return 0.5 * (mass * (v * v).sum(-1)).sum(-1)
@@ -83,7 +93,7 @@ def strain_energy(F, volume, table):
 
 
 def spin(p, dx, *, inverse_inertia=4.0):
-    """Angular momentum Σ m x × v and what APIC keeps in C (Jiang et al. 2015, eq. 11) [kg m²/s]."""
+    """Angular momentum Σ m x × v and the part that APIC keeps in C (Jiang et al. 2015, eq. 11) [kg m²/s]."""
     axial = jnp.stack([p.C[:, 2, 1] - p.C[:, 1, 2], p.C[:, 0, 2] - p.C[:, 2, 0], p.C[:, 1, 0] - p.C[:, 0, 1]], -1)
     return (p.mass[:, None] * (jnp.cross(p.x, p.v) + dx**2 / inverse_inertia * axial)).sum(0)
 

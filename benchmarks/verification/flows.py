@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from pigjax.mls_mpm import SimConfig, rollout
+from benchmarks.verification.common import Case, Row, elastic, held, lattice, nodes, particles, percent, simulate
+from pigjax.mls_mpm import SimConfig
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.materials import Material, material_table
-from verification.common import Case, Row, elastic, held, lattice, nodes, particles, percent
 
 GRAVITY = 9.81
 # Martin and Moyce 1952 (doi 10.1098/rsta.1952.0006), table 2: n² = 2, a = 2.25 in; T = t √(2 g / a), Z = front / a
@@ -27,17 +27,8 @@ def front(cells, kernel="quadratic"):
     p = particles(x, volume=dx**3 / 4, table=table)
     grid = nodes(dx, 6 * cells, 2 * cells + 10, 8, origin=[-2 * dx, -2 * dx, -3 * dx])
     scale = math.sqrt(2 * GRAVITY / a)
-    _, path, health = rollout(
-        p,
-        grid,
-        table,
-        SimConfig(kernel=kernel, walls="slip"),
-        frames=frames,
-        frame_dt=last / scale / frames,
-        gravity=(0.0, -GRAVITY, 0.0),
-        colliders=held(2),
-    )
-    health.raise_if_bad()
+    config, steps = SimConfig(kernel=kernel, walls="slip"), {"frames": frames, "frame_dt": last / scale / frames}
+    _, path = simulate(p, grid, table, config, **steps, gravity=(0.0, -GRAVITY, 0.0), colliders=held(2))
     x = np.asarray(path.x)
     return last * np.arange(1, frames + 1) / frames, (x[..., 0].max(1) + dx / 4) / a, x[-1, :, :2] / a
 
@@ -57,21 +48,14 @@ def dam_break():
         ours = np.interp(FRONT_T, T, Z)
         error = np.abs(ours / FRONT_Z - 1)
         name = f"dam break, {cells} cells wide"
-        rows.append(
-            Row(
-                f"{name}: front",
-                "Martin and Moyce 1952, table 2",
-                f"Z({FRONT_T[-1]}) = {FRONT_Z[-1]}",
-                f"{ours[-1]:.2f}",
-                f"mean {100 * error.mean():.1f} %, worst {100 * error.max():.1f} %",
-            )
-        )
+        figures = f"Z({FRONT_T[-1]}) = {FRONT_Z[-1]}", f"{ours[-1]:.2f}"
+        errors = f"mean {100 * error.mean():.1f} %, worst {100 * error.max():.1f} %"
+        rows.append(Row(f"{name}: front", "Martin and Moyce 1952, table 2", *figures, errors))
         speed = np.polyfit(FRONT_T[FRONT_Z > 2], FRONT_Z[FRONT_Z > 2], 1)[0]
         part = (Z > 2) & (Z < 4.11)
         own = np.polyfit(T[part], Z[part], 1)[0]
-        rows.append(
-            Row(f"{name}: speed", "same, slope for Z > 2", f"{speed:.3f}", f"{own:.3f}", percent(own / speed - 1))
-        )
+        figures = f"{speed:.3f}", f"{own:.3f}", percent(own / speed - 1)
+        rows.append(Row(f"{name}: speed", "same, slope for Z > 2", *figures))
 
     def draw(figure):
         front_axes, water = figure.subplots(2, 1, height_ratios=(3, 1))
@@ -117,17 +101,9 @@ def column(aspect, cells, *, angle, axisymmetric):
     p = particles(x, volume=volume, table=table)
     floor = Plane(1e-4 * dx * np.eye(3)[up], np.eye(3)[up], mode="sticky")
     frames = 20
-    end, _, health = rollout(
-        p,
-        grid,
-        table,
-        SimConfig(walls="slip"),
-        frames=frames,
-        frame_dt=5 * math.sqrt(high / GRAVITY) / frames,
-        gravity=tuple(-GRAVITY * np.eye(3)[up]),
-        colliders=(floor, *across),
-    )
-    health.raise_if_bad()
+    config, steps = SimConfig(walls="slip"), {"frames": frames, "frame_dt": 5 * math.sqrt(high / GRAVITY) / frames}
+    gravity = tuple(-GRAVITY * np.eye(3)[up])
+    end, _ = simulate(p, grid, table, config, **steps, gravity=gravity, colliders=(floor, *across))
     x = np.asarray(end.x) / wide
     away = np.hypot(x[:, 0], x[:, 1]) if axisymmetric else x[:, 0]
     edges = np.arange(0, away.max() + 2 / cells, 1 / cells)
@@ -166,10 +142,8 @@ def sand_cylinder():
     case = _columns("sand cylinder", [(1.0, cells) for cells in studies], axisymmetric=True)
     (coarse, fine), expected = (float(row.ours) for row in case.rows), lube(1.0, True)
     limit = fine + (fine - coarse) * studies[0] / (studies[1] - studies[0])
-    estimate = percent(limit / expected - 1)
-    case.rows.append(
-        Row("sand cylinder, extrapolated", "Lube et al. 2004", f"{expected:.2f}", f"{limit:.2f}", estimate)
-    )
+    figures = f"{expected:.2f}", f"{limit:.2f}", percent(limit / expected - 1)
+    case.rows.append(Row("sand cylinder, extrapolated", "Lube et al. 2004", *figures))
     return case
 
 

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-import statistics
-import time
 
-import jax
 import numpy as np
 
-from pigjax.mls_mpm import SimConfig, rollout
-from verification.bars import SPEED, bar
-from verification.common import (
-    NO_GRAVITY,
+from benchmarks.common.timing import in_turn
+from benchmarks.verification.bars import SPEED, bar
+from benchmarks.verification.common import (
     Case,
     Row,
     elastic,
@@ -22,24 +18,24 @@ from verification.common import (
     lattice,
     nodes,
     particles,
+    simulate,
     spin,
     strain_energy,
 )
+from pigjax.mls_mpm import SimConfig
 
 KERNELS = ("quadratic", "cubic")
+STEPS = 20  # of a run that is timed
 INVERSE_INERTIA = {"quadratic": 4.0, "cubic": 3.0}
 
 
-def ringing(kernel, cells=16, periods=20):
+def ringing(kernel, cells=16, periods=20, simulate=simulate):
     """Periods and energy of a free bar's first mode, as a share of the start's."""
     p, grid, table, _ = bar(cells, "free", amplitude=0.05)
     frames = 20 * periods
     frame_dt = 2 / SPEED / 20
     config = SimConfig(kernel=kernel, substeps=math.ceil(frame_dt * SPEED * cells / 0.35))
-    _, path, health = rollout(
-        p, grid, table, config, frames=frames, frame_dt=frame_dt, gravity=NO_GRAVITY, colliders=held(0, 1)
-    )
-    health.raise_if_bad()
+    _, path = simulate(p, grid, table, config, frames=frames, frame_dt=frame_dt, colliders=held(0, 1))
     energy = kinetic(p.mass, path.v) + strain_energy(path.F_visual, p.volume0, table)
     return np.arange(1, frames + 1) / 20, np.asarray(energy / kinetic(p.mass, p.v))
 
@@ -49,7 +45,7 @@ def energy_kept(energy):
     return energy[-20:].mean() / energy[:20].mean()
 
 
-def turning(kernel, cells=8, turns=1.0):
+def turning(kernel, cells=8, turns=1.0, simulate=simulate):
     """Share of kinetic energy kept, and of angular momentum lost, by a free block after whole turns."""
     dx, omega = 1 / cells, 2 * math.pi
     half = 3 * dx
@@ -59,25 +55,19 @@ def turning(kernel, cells=8, turns=1.0):
     table = elastic(young=1e6, poisson=0.3)
     p = particles(x, volume=(dx / 2) ** 3, table=table, v=v, C=C)
     grid = nodes(dx, 24, 24, 24, origin=[-11.5 * dx] * 3)
-    end, _, health = rollout(p, grid, table, SimConfig(kernel=kernel), frames=1, frame_dt=turns, gravity=NO_GRAVITY)
-    health.raise_if_bad()
+    end, _ = simulate(p, grid, table, SimConfig(kernel=kernel), frames=1, frame_dt=turns)
     spins = [spin(q, dx, inverse_inertia=INVERSE_INERTIA[kernel])[2] for q in (p, end)]
     return float(kinetic(p.mass, end.v) / kinetic(p.mass, p.v)), abs(float(spins[1] / spins[0] - 1))
 
 
-def seconds(kernel, count=10_000, cells=64, steps=20, repeats=5):
-    """Warm median of the time of a substep of a random cube [s]."""
+def substeps(kernel, simulate=simulate, count=10_000, cells=64):
+    """A run of STEPS substeps of a random cube."""
     x = np.random.default_rng(0).random((count, 3)) * 0.3 + 0.35
     table = elastic(young=1e5, poisson=0.2)
     p = particles(x, volume=0.3**3 / count, table=table)
     grid = nodes(1 / cells, cells, cells, cells)
-    config = SimConfig(kernel=kernel, substeps=steps)
-    times = []
-    for _ in range(repeats + 1):
-        begun = time.perf_counter()
-        jax.block_until_ready(rollout(p, grid, table, config, frames=1, frame_dt=steps * 1e-4, gravity=NO_GRAVITY))
-        times.append((time.perf_counter() - begun) / steps)
-    return statistics.median(times[1:])
+    config = SimConfig(kernel=kernel, substeps=STEPS)
+    return lambda: simulate(p, grid, table, config, frames=1, frame_dt=STEPS * 1e-4)[0].x
 
 
 def kernels():
@@ -96,19 +86,11 @@ def kernels():
         rows.append(Row(f"ringing bar, {kernel}", "energy conserved", "1", f"{kept:.4f}", f"{100 * (kept - 1):+.1f} %"))
     for kernel in KERNELS:
         kept, drift = in_float64(turning)(kernel)
-        rows.append(
-            Row(
-                f"turning block, {kernel}: kinetic energy",
-                "conserved",
-                "1",
-                f"{kept:.4f}",
-                f"{100 * (kept - 1):+.1f} %",
-            )
-        )
-        rows.append(Row(f"turning block, {kernel}: angular momentum", "conserved", "0", f"{drift:.0e}", f"{drift:.0e}"))
-    for kernel in KERNELS:
-        took = seconds(kernel)
-        rows.append(Row(f"time of a substep, {kernel}", "", "", f"{1e3 * took:.2f} ms", ""))
+        name = f"turning block, {kernel}"
+        rows.append(Row(f"{name}: kinetic energy", "conserved", "1", f"{kept:.4f}", f"{100 * (kept - 1):+.1f} %"))
+        rows.append(Row(f"{name}: angular momentum", "conserved", "0", f"{drift:.0e}", f"{drift:.0e}"))
+    for kernel, run in in_turn({kernel: substeps(kernel) for kernel in KERNELS}).items():
+        rows.append(Row(f"time of a substep, {kernel}", "", "", f"{1e3 * run.seconds / STEPS:.2f} ms", ""))
 
     def draw(figure):
         axes = figure.subplots()

@@ -1,4 +1,4 @@
-"""What `pigjax segment` and `pigjax info` leave and say: objects as files, and files in words."""
+"""`pigjax segment` and `pigjax info`: objects as files, and files in words."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def segment_files(
     """Lift masks and write `labels.npz`, `objects/<id>_<name>.ply`, `coloured.ply` and `objects.png`. Host.
 
     For each object to remove also `removed/<id>_<name>.ply`, the scene without it, `removed/<id>_<name>/<view>.png`,
-    its hole in every view (white: what an inpainter must fill in), and `removed/<id>_<name>.png`, a few views before
+    its hole in every view (white: pixels for an inpainter), and `removed/<id>_<name>.png`, a few views before
     and after with the hole in magenta. Names of objects and views enter names of files by `io.safe_name`, so nothing
     is written outside of these folders.
 
@@ -58,15 +58,15 @@ def segment_files(
         out: folder, made if it is missing.
         fill: give unseen Gaussians the id of their neighbours.
         remove: names or ids of objects.
-        origin: what was subtracted from the scene's positions [m]; the files get it back. None: nothing.
-        overwrite: remove what `out` holds of other Gaussians, views, masks, names or settings, instead of refusing it.
+        origin: offset subtracted from the scene's positions [m], added again in the files; None: none.
+        overwrite: remove results in `out` of other Gaussians, views, masks, names or settings, instead of refusing it.
         settings: of `lift_masks`.
 
     Returns:
         Gaussians of each id.
 
     Raises:
-        StaleError: `out` holds results of something else; it names what changed.
+        StaleError: `out` holds results of other inputs; it names the changes.
         InputError: masks that do not fit the views, files that cannot be written, or an unknown object.
     """
     doomed = [_id_of(name, names) for name in remove]
@@ -115,7 +115,9 @@ def _id_of(name: str, names: dict[int, str]) -> int:
         return found
     if name.isascii() and name.isdecimal() and len(name) <= 10:
         return int(name)
-    raise InputError(f"--remove {name}: {suggest(name, list(names.values())) if names else 'give its id, or names'}.")
+    raise InputError(
+        f"--remove {name[:40]}: {suggest(name, list(names.values())) if names else 'give its id, or names'}."
+    )
 
 
 def _remove(
@@ -149,7 +151,7 @@ def _sheet(gaussians: Gaussians, views: io.Views, labels: Labels, names: dict[in
 
 
 def describe_file(path: Path) -> dict[str, str]:
-    """What a file holds, in words. Host.
+    """Contents of a file, in words. Host.
 
     Raises:
         MissingFileError: there is no such file.
@@ -211,7 +213,7 @@ def _box(points: np.ndarray) -> str:
 
 
 def _numbers(values: Any, span: Any) -> list[str]:
-    """Values with three digits of what they span, however far from the origin."""
+    """Values with three digits of their span, however far from the origin."""
     largest = max(abs(float(value)) for value in values)
     more = math.ceil(math.log10(largest / span)) if 0 < span < largest < math.inf else 0
     return [f"{value:.{min(3 + more, 15)}g}" for value in values]

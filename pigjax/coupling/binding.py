@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from pigjax.clamp import ClampParams, clamped_shapes
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import array_field, einsum, in_precision
+from pigjax.core.arrays import array_field, einsum, in_precision, real_field
 from pigjax.core.errors import InputError
 from pigjax.coupling.seeding import object_ids
 from pigjax.mpm import Particles, Trajectory
@@ -26,8 +26,8 @@ class Binding(eqx.Module):
 
     gaussian: Int[Array, "m"] = array_field()  # index of the Gaussian
     particles: Int[Array, "m k"] = array_field()  # indices of its carriers
-    weights: Float[Array, "m k"] = array_field()  # of the carriers; sum to 1
-    offsets: Float[Array, "m k 3"] = array_field()  # from each particle to the Gaussian, at rest [m]
+    weights: Float[Array, "m k"] = real_field()  # of the carriers; sum to 1
+    offsets: Float[Array, "m k 3"] = real_field()  # from each particle to the Gaussian, at rest [m]
 
     def __len__(self) -> int:
         return self.gaussian.shape[0]

@@ -51,6 +51,8 @@ def prune(
 ) -> Gaussians:
     """The `budget` Gaussians that contribute most to these views, in their old order. Host.
 
+    `python -m benchmarks prune` measures what that costs in picture quality, and what it saves in time.
+
     Args:
         gaussians: the scene.
         views: photos or cameras; their pixels count.

@@ -5,6 +5,7 @@ The loss is that of 3DGS (Kerbl et al. 2023); relocation and noise are those of 
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -124,7 +125,7 @@ def reconstruct(
 
     parts = provenance(views, config, points)
     state = start(count_at(0, config))
-    if checkpoint is not None and checkpoint.exists():
+    if checkpoint is not None and os.path.exists(checkpoint):
         state = _resume(checkpoint, start, config, parts, overwrite)
     photos = _photos(train, config)
     if photos.mattes is not None and not photos.mattes.any():

@@ -69,6 +69,10 @@ class FitConfig(eqx.Module):
         check_fields(self)
         if not isinstance(self.render, RenderConfig):
             raise InputError(f"FitConfig.render = {shown(self.render)}: must be a RenderConfig.")
+        if self.start_splats is not None and self.start_splats > self.splats:
+            raise InputError(
+                f"FitConfig.start_splats = {self.start_splats}: must not be above splats = {self.splats}, its end."
+            )
         if self.start_splats is not None and (reached := count_at(self.steps - 1, self)) < self.splats:
             raise InputError(
                 f"FitConfig.start_splats = {self.start_splats} doubles to {reached} of splats = {self.splats}"

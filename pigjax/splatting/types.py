@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from pigjax.core.arrays import array_field, static_field
-from pigjax.core.checks import LARGEST_WHOLE, Limits, check_fields
+from pigjax.core.arrays import real_field, static_field
+from pigjax.core.checks import LARGEST_WHOLE, Limits, check_axes, check_fields
 from pigjax.core.errors import InputError
 from pigjax.core.extent import Extent, scene_extent
 from pigjax.core.gaussians import Gaussians
@@ -30,14 +30,21 @@ OUTPUTS = ("rgb", "alpha", "depth", "surface_depth", "object_weights", "normals"
 
 
 class Splats(eqx.Module):
-    """Posed Gaussians, ready to draw. The covariance of each is factors @ factorsᵀ."""
+    """Posed Gaussians, ready to draw. The covariance of each is factors @ factorsᵀ.
 
-    means: Float[Array, "n 3"] = array_field()  # [m]
-    factors: Float[Array, "n 3 3"] = array_field()  # [m]
-    opacities: Float[Array, "n"] = array_field()  # in [0, 1]
-    sh: Float[Array, "n k 3"] = array_field()  # spherical harmonics, k = (degree + 1)²
+    Raises:
+        InputError: an array has not its axes, or is not as long as the others.
+    """
+
+    means: Float[Array, "n 3"] = real_field()  # [m]
+    factors: Float[Array, "n 3 3"] = real_field()  # [m]
+    opacities: Float[Array, "n"] = real_field()  # in [0, 1]
+    sh: Float[Array, "n k 3"] = real_field()  # spherical harmonics, k = (degree + 1)²
     # rotation of the matter since rest; view-dependent colour turns with it
-    sh_rotations: Float[Array, "n 3 3"] | None = array_field(default=None)
+    sh_rotations: Float[Array, "n 3 3"] | None = real_field(default=None)
+
+    def __check_init__(self):
+        check_axes(self)
 
     def __len__(self) -> int:
         return self.means.shape[0]

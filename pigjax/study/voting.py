@@ -59,7 +59,7 @@ class Voting(eqx.Module):
         """Loss and agreement of the objects with the held-out masks.
 
         A Gaussian belongs to each object by its share of the votes, or of one where it has less (all to the winner
-        where votes are hard), a pixel by what is blended in it. `iou` is the mean over objects of
+        where votes are hard), a pixel by the splats blended in it. `iou` is the mean over objects of
         Σ min(share, mask) / Σ max(share, mask); the loss is 1 - iou.
         """
         labels = lift_masks(

@@ -5,10 +5,10 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from baselines.box_selection import bounding_box, in_box, select_by_box
-from baselines.feature_distillation import THRESHOLDS, select_by_similarity, similarities, train_features
-from baselines.identity_encoding import encoded_ids, image_ids, neighbour_divergence, train_encoding
 
+from benchmarks.baselines.box_selection import bounding_box, in_box, select_by_box
+from benchmarks.baselines.feature_distillation import THRESHOLDS, select_by_similarity, similarities, train_features
+from benchmarks.baselines.identity_encoding import encoded_ids, image_ids, neighbour_divergence, train_encoding
 from pigjax.core.camera import look_at, stack_cameras
 from pigjax.io import Views
 from pigjax.splat import Gaussians

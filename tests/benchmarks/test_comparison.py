@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from baselines import mass_spring
-from baselines.region_boxes import ids_in_boxes
-from baselines.rigid_topk import driving_points, follow, nearest_drivers
-from baselines.surface_only import ids_by_members
-from comparison import scores
 from scipy.spatial.transform import Rotation
 
+from benchmarks.baselines import mass_spring
+from benchmarks.baselines.region_boxes import ids_in_boxes
+from benchmarks.baselines.rigid_topk import driving_points, follow, nearest_drivers
+from benchmarks.baselines.surface_only import ids_by_members
+from benchmarks.comparison import scores
 from pigjax.mpm.colliders import Plane
 
 RNG = np.random.default_rng(0)

@@ -1,9 +1,9 @@
 """Every reader answers any damage with its object or with the project's error."""
 
-import fuzz
-from _readers import READERS
+from benchmarks.fuzz import parts as fuzz
+from benchmarks.fuzz.readers import READERS
 
-COUNT = 300  # python benchmarks/fuzz.py --count 20000 reads many more
+COUNT = 300  # python -m benchmarks fuzz --count 20000 reads many more
 
 
 def test_every_reader_reads_damaged_files_or_refuses_them():

@@ -1,4 +1,4 @@
-"""Cases of docs/VERIFICATION.md in their cheapest form; each tolerance is the figure seen there and some room."""
+"""Cases of docs/results/VERIFICATION.md in their cheapest form; each tolerance is the figure there and some room."""
 
 import math
 
@@ -6,13 +6,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from verification.bars import period
-from verification.bodies import TOUCH, discs, modulus, parting, sag
-from verification.classic import classic_force
-from verification.flows import FRONT_T, FRONT_Z, column, friction_angle, front, lube
-from verification.kernels import energy_kept, ringing, turning
-from verification.manufactured import cube_error, free_error, vortex_error
 
+from benchmarks.verification.bars import period
+from benchmarks.verification.bodies import TOUCH, discs, modulus, parting, sag
+from benchmarks.verification.classic import plain_step
+from benchmarks.verification.common import held
+from benchmarks.verification.flows import FRONT_T, FRONT_Z, column, friction_angle, front, lube
+from benchmarks.verification.kernels import energy_kept, ringing, turning
+from benchmarks.verification.manufactured import cube_error, free_error, vortex_error
 from pigjax.mls_mpm import SimConfig, step
 from pigjax.mpm import Grid, make_particles
 from pigjax.mpm.contact import BodyContact
@@ -191,6 +192,21 @@ def classic_step(x, v, C, F, mass, volume, table, dx, dt):
     return x + dt * new_v, new_v, new_C, F + dt * gradient @ F
 
 
+@pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
+def test_plain_step_of_mls_mpm_is_the_librarys(x64, kernel):
+    """What the classic force is compared with computes what users get."""
+    rng, dt = np.random.default_rng(0), 1e-3
+    table = material_table([Material("neo_hookean", density=1000.0, young=1e4, poisson=0.3)])
+    made = make_particles(0.6 + 0.2 * jnp.asarray(rng.random((12, 3))), volume=1e-4, table=table)
+    v, C, F = rng.normal(size=(12, 3)), rng.normal(size=(12, 3, 3)), np.eye(3) + 0.1 * rng.normal(size=(12, 3, 3))
+    given = eqx.tree_at(lambda p: (p.v, p.C, p.F), made, tuple(map(jnp.asarray, (v, C, F))))
+    domain, config = Grid(jnp.zeros(3), jnp.asarray(0.1), (16, 16, 16)), SimConfig(kernel=kernel, force=True)
+    setup, steps = (given, domain, table, config, dt), {"gravity": (0.0, 0.0, -9.8), "colliders": held(0)}
+    (plain, _), (ours, _) = plain_step("MLS", *setup, **steps), step(*setup, **steps)
+    for name in ("x", "v", "C", "F"):
+        np.testing.assert_allclose(getattr(plain, name), getattr(ours, name), rtol=1e-9, atol=1e-9, err_msg=name)
+
+
 def test_classic_force_is_that_of_the_weights_gradients(x64):
     """Against loops over nodes; MLS-MPM's step differs from it."""
     rng, dx, dt = np.random.default_rng(0), 0.1, 1e-3
@@ -201,9 +217,7 @@ def test_classic_force_is_that_of_the_weights_gradients(x64):
     domain = Grid(jnp.zeros(3), jnp.asarray(dx), (16, 16, 16))
     setup = (given, domain, table, SimConfig(force=True), dt)
     expected = classic_step(np.asarray(given.x), v, C, F, np.asarray(given.mass), 1e-4, table, dx, dt)
-    with classic_force():
-        ours, _ = step(*setup, gravity=(0.0, 0.0, 0.0))
-    mls, _ = step(*setup, gravity=(0.0, 0.0, 0.0))
+    ours, mls = (plain_step(force, *setup, gravity=(0.0, 0.0, 0.0))[0] for force in ("classic", "MLS"))
     for name, exact in zip(("x", "v", "C", "F"), expected):
         np.testing.assert_allclose(getattr(ours, name), exact, rtol=1e-9, atol=1e-9, err_msg=name)
     assert float(jnp.abs(mls.F - ours.F).max()) > 1e-4

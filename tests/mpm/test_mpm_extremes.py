@@ -1,6 +1,6 @@
 """MLS-MPM at its extremes: what is not healthy is counted by name or refused, and harms nothing else.
 
-Most tests share one compiled rollout: 64 particles of two materials for 40 steps. `benchmarks/bench_stability.py` does
+Most tests share one compiled rollout: 64 particles of two materials for 40 steps. `python -m benchmarks stability` does
 the same for every law and prints how large the errors are.
 """
 
@@ -443,7 +443,7 @@ REFUSED = {
         lambda: make_particles(jnp.zeros((1, 3), jnp.float32), volume=1e-40, table=TABLE),
         r"volume = .*e-41|volume = 1e-40|volume = 0",
     ),
-    "dx 0": (lambda: Grid(jnp.zeros(3), jnp.asarray(0.0), (16, 16, 16)), r"Grid\.dx = 0\.0: .* must be > 0 m"),
+    "dx 0": (lambda: Grid(jnp.zeros(3), jnp.asarray(0.0), (16, 16, 16)), r"Grid\.dx = 0\.0: must be > 0 m"),
     "dx < 0": (lambda: Grid(jnp.zeros(3), jnp.asarray(-1.0), (16, 16, 16)), r"Grid\.dx = -1\.0"),
     "dx NaN": (lambda: Grid(jnp.zeros(3), jnp.asarray(jnp.nan), (16, 16, 16)), r"Grid\.dx = nan"),
     "origin NaN": (lambda: Grid(jnp.full(3, jnp.nan), jnp.asarray(1.0), (16, 16, 16)), r"Grid\.origin = \[nan"),
@@ -540,7 +540,7 @@ SILENT_ONCE = {
     "min_J and max_courant are NaN once a particle is (substep.py: _check)": numbers_of_health,
     "float32 rounds away slow motion in stiff matter (substep.py: cells + dt/dx v)": slow_matter,
     "the square of a speed of 1e30 m/s overflows unseen (mls_mpm.py: _max_speed)": one_of_huge_speed,
-    "only stationary matter (substep.py: to_grid)": nothing_moves,
+    "only stationary matter (substep.py: particles_to_grid)": nothing_moves,
     "frame_dt < 0 (mls_mpm.py)": partial(refused, frame_dt=-1e-2),
     "frame_dt NaN (mls_mpm.py)": partial(refused, frame_dt=float("nan")),
     "gravity NaN (mls_mpm.py)": partial(refused, gravity=(0.0, 0.0, float("nan"))),

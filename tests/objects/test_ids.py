@@ -14,7 +14,7 @@ from PIL import Image
 
 from pigjax.core.camera import look_at, stack_cameras
 from pigjax.core.errors import InputError, SceneError
-from pigjax.io import id_named, load_masks, load_names
+from pigjax.io import id_named, load_masks, load_names, read_image
 from pigjax.objects.lifting import lift
 from pigjax.objects.overlay import colours_of, id_colours, overlay
 from pigjax.scene.plan import Inputs, _id_of, segment
@@ -114,6 +114,21 @@ def test_pictures_that_hold_no_ids_are_refused(tmp_path, mode):
     (tmp_path / "a.tif").rename(tmp_path / "a.png")
     with pytest.raises(InputError, match=rf"a\.png: mask has pixels of kind {mode}"):
         load_masks(tmp_path, ["a"], SIZE)
+
+
+@pytest.mark.parametrize("kind", ["EPS", "PCX"])
+def test_files_of_other_kinds_are_not_opened_whatever_their_name(tmp_path, kind):
+    """Pillow starts Ghostscript for EPS."""
+    Image.new("RGB", SIZE).save(tmp_path / "a.png", format=kind)
+    with pytest.raises(InputError, match=r"a\.png: not a readable image \(none of PNG, JPEG"):
+        read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("background", [np.nan, 7.0, (0.0, -1.0, 0.0)])
+def test_a_background_that_is_no_colour_is_refused(tmp_path, background):
+    Image.new("RGBA", SIZE).save(tmp_path / "a.png")
+    with pytest.raises(InputError, match=r"a\.png: background = .*: must be"):
+        read_image(tmp_path / "a.png", background=background)
 
 
 @pytest.mark.parametrize("far", [60000, 2_000_000_000])

@@ -1,0 +1,1 @@
+"""Shared by all benchmarks: the command line, the timer and the pages."""

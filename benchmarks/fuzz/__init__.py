@@ -1,0 +1,1 @@
+"""Damaged files for every reader: the valid files, the damage, and the processes that read."""
