@@ -64,8 +64,8 @@ def render(
             are traced. A normal is the shortest axis of a splat.
         object_weights: membership of each splat in each object, needed for the output of that name.
         features: any channels of each splat, needed for the output of that name.
-        tau_T: transmittance below which the surface lies, in [0, 1]; half by default, where most of the light has
-            stopped (PIG, section 3.2); not differentiated.
+        tau_T: transmittance below which the surface lies, in [0, 1] (PIG, section 3.2); half by default, which gives
+            the median depth; not differentiated.
 
     Returns:
         The outputs asked for, and the splat/tile pairs dropped for want of capacity (see `RenderConfig.capacity`).

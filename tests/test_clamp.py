@@ -326,7 +326,7 @@ def test_weights_can_be_swept_by_vmap():
         assert error(covariances(swept[k]), covariances(single)) < 1e-4
 
 
-def test_new_weights_do_not_compile_anew():
+def test_new_weights_do_not_recompile():
     traces = []
     counted = jax.jit(lambda g, F, p: (traces.append(1), eigen_clamp(g, F, p).factors)[1])
     gaussians, (F, _) = make_gaussians(random_rotations(0), random_scales()), stretches()

@@ -1,4 +1,4 @@
-"""Votes at the edge of what scenes, cameras and masks can be: each case has its exact outcome or its exact error."""
+"""Votes at the extremes of scenes, cameras and masks: each case has its exact result or its exact error."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ AWAY = Camera(np.diag([1.0, -1, -1, 1])[None], np.full((1, 2), 16.0), np.full((1
 
 
 def padded(means, **options):
-    """As many Gaussians as the wall has, so that nothing compiles anew: the rest stands behind the camera."""
+    """As many Gaussians as the wall has, so that nothing recompiles: the rest stands behind the camera."""
     behind = np.tile([0.0, 0.0, -1.0], (SIZE**2 - len(means), 1))
     return opaque(np.concatenate([means, behind]), **options)
 

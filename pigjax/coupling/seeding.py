@@ -164,10 +164,10 @@ def _matter_of(
     if fill and 0 < solid.volume < step**3:
         raise InputError(f"{name} holds {solid.volume:.3g} m³, less than one particle at {step:.3g} m; refine spacing.")
     points, contents = lattice_cells(solid, step, max_particles=max_particles, name=name)
-    room = ~_taken(points, item, objects)
+    vacant = ~_taken(points, item, objects)
     for collider in colliders:
-        room &= np.asarray(collider.distance(jnp.asarray(points))) > 0
-    points, contents = points[room], contents[room]
+        vacant &= np.asarray(collider.distance(jnp.asarray(points))) > 0
+    points, contents = points[vacant], contents[vacant]
 
     own = np.flatnonzero(shell.connected)
     lattice = np.floor((np.concatenate([points, shell.means[own]]) - solid.low) / step)

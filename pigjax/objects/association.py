@@ -68,8 +68,8 @@ def associate_masks(
             early view knows only a part of an object.
         merge: groups are merged where one mask holds both in more than this share of the views that show both; a
             majority by default. 1 merges none, for masks that are known to be whole objects.
-        tau_T: transmittance below which the surface lies, in [0, 1]; the paper's default.
-        tau_d: depth tolerance relative to the surface depth, in [0, 1]; the paper's default.
+        tau_T: transmittance below which the surface lies, in [0, 1]; as of `lift_masks`.
+        tau_d: depth tolerance relative to the surface depth, in [0, 1]; as of `lift_masks`.
         config: the renderer's settings.
 
     Returns:
@@ -77,7 +77,7 @@ def associate_masks(
         Gaussian becomes background.
 
     Raises:
-        InputError: no views, masks that do not fit the cameras or show no Gaussian at all, negative ids, or thresholds
+        InputError: no views, masks that do not fit the cameras or show no Gaussian, negative ids, or thresholds
             outside [0, 1].
     """
     check_masks(cameras, per_view_masks)

@@ -141,9 +141,9 @@ def tile_boxes(projected: Projected, config: BlendConfig) -> tuple[Int[Array, "n
     return low, jnp.where(projected.visible[:, None], jnp.maximum(high - low, 0), 0)
 
 
-def rows_in_order(projected: Projected, features: Float[Array, "n c"], boxes: Boxes) -> Float[Array, "n f"]:
+def rows_in_order(projected: Projected, boxes: Boxes, *features: Float[Array, "n _"]) -> Float[Array, "n f"]:
     """Rows that tiles composite, front to back: shape columns, then features."""
-    return jnp.concatenate([projected.shapes, features], 1)[boxes.order]
+    return jnp.concatenate([projected.shapes, *features], 1)[boxes.order]
 
 
 def untile(planes: Float[Array, "tiles c pixels"], config: BlendConfig) -> Float[Array, "h w c"]:

@@ -79,7 +79,7 @@ def composite(
     """
     extra = [projected.depths[:, None]] if config.surface else []
     ones = jnp.ones_like(projected.depths)[:, None]
-    table = rows_in_order(projected, jnp.concatenate([features, ones, *extra], 1), boxes)
+    table = rows_in_order(projected, boxes, features, ones, *extra)
     tau = lax.stop_gradient(jnp.asarray(tau, table.dtype))
     of_tiles = composite_tiles if reverse else composite_by_scan
     planes, overflow = (of_tiles if config.shards == 1 else shard_rows(of_tiles))(table, boxes, tau, config)

@@ -107,5 +107,5 @@ def _chunks_of(splats: Splats, camera: Camera, config: RenderConfig) -> tuple[Ch
     blending = blend_config(camera, config, len(splats), surface=True)
     with jax.named_scope("bin"):
         boxes = bin_splats(projected, blending)
-    chunks, overflow = all_chunks(rows_in_order(projected, projected.depths[:, None], boxes), boxes, blending)
+    chunks, overflow = all_chunks(rows_in_order(projected, boxes, projected.depths[:, None]), boxes, blending)
     return chunks, blending, overflow

@@ -8,7 +8,6 @@ static capacity: splats that do not fit are dropped and counted.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -78,16 +77,14 @@ def scan_chunks(
         config: static settings.
         visit: function of one chunk, its alpha [k p] and its `Blend`; any array.
     """
-    dtype, pixels = chunks.rows.dtype, config.tile**2
-    plane: Any = jax.ShapeDtypeStruct((config.chunk, pixels), dtype)
-    pixel_row: Any = jax.ShapeDtypeStruct((pixels,), dtype)
-    one_chunk = jax.tree.map(lambda leaf: leaf[0], chunks)
-    result = jax.eval_shape(visit, one_chunk, plane, Blend(plane, plane, pixel_row))
 
     def composite_chunk(transmittance, chunk: Chunks):
         alpha, _ = tile_alphas(chunk.rows, chunk.valid, config)
         blend = blend_chunk(alpha, transmittance, config)
         return blend.behind, visit(chunk, alpha, blend)
+
+    start = jnp.ones(config.tile**2, chunks.rows.dtype)
+    _, result = jax.eval_shape(composite_chunk, start, jax.tree.map(lambda leaf: leaf[0], chunks))
 
     def skip(transmittance, chunk: Chunks):
         return transmittance, jnp.zeros(result.shape, result.dtype)
@@ -100,7 +97,7 @@ def scan_chunks(
         is_open = jnp.max(transmittance) > config.transmittance_min
         return lax.cond(needed & is_open, composite_chunk, skip, transmittance, chunk)
 
-    return lax.scan(step, jnp.ones(pixels, dtype), (chunks, needed))[1]
+    return lax.scan(step, start, (chunks, needed))[1]
 
 
 def _cut(table: Float[Array, "n f"], boxes: Boxes, lists: TileLists, config: BlendConfig) -> Chunks:

@@ -115,7 +115,7 @@ class RenderConfig(eqx.Module):
     bands: int = static_field(default=1, limits=Limits(1, 4096))
     # "reverse": the fast compositor with its hand-written backward pass. "forward": a scan that every mode and order
     # of differentiation (jvp, hessian) goes through; it is slower, and its lists have a static capacity: 16 pairs per
-    # splat unless given (`required_capacity` finds it). What does not fit is counted in Frame.overflow
+    # splat unless given (`required_capacity` finds it). Pairs that do not fit are counted in Frame.overflow
     differentiation: str = static_field(default="reverse", choices=("reverse", "forward"))
 
     def __check_init__(self):

@@ -197,9 +197,9 @@ def test_gradients_of_the_drawing_to_positions_and_deformation(x64):
         direction = [jnp.zeros_like(part) for part in state]
         direction[argument] = jnp.asarray(rng.normal(size=state[argument].shape))
         ahead, behind = (
-            loss(tuple(part + sign * 1e-5 * way for part, way in zip(state, direction)))[0] for sign in (1, -1)
+            loss(tuple(part + sign * 1e-5 * step for part, step in zip(state, direction)))[0] for sign in (1, -1)
         )
-        exact = sum(jnp.vdot(part, way) for part, way in zip(gradient, direction))
+        exact = sum(jnp.vdot(part, step) for part, step in zip(gradient, direction))
         assert float(exact) == pytest.approx(float((ahead - behind) / 2e-5), rel=1e-8)
 
 

@@ -79,7 +79,7 @@ def test_segment_writes_every_object_and_the_scene_without_one_with_its_hole(tmp
     said = CliRunner().invoke(app, command, catch_exceptions=False)
     assert said.exit_code == 0
     with np.load(tmp_path / "out/labels.npz") as written:
-        # of the floor, what the lid hides is never seen
+        # the part of the floor under the lid is never seen
         hidden = np.asarray(labels.object_id == FLOOR) & (written["object_id"] < 0)
         assert np.abs(means[hidden, :2]).max() < 0.52  # its edge and three standard deviations
         np.testing.assert_array_equal(written["object_id"][~hidden], labels.object_id[~hidden])

@@ -208,7 +208,7 @@ def test_pose_refinement_takes_back_a_shifted_camera(views):
 
     before, after = error(moved.subset("train").cameras), error(result.cameras)
     print(f"pose error {before:.3f} before, {after:.3f} after")
-    # the cloud may drift with the cameras, so the way back is not all of it
+    # the cloud may drift with the cameras, so the correction recovers a part of it
     assert after < 0.5 * before
 
 

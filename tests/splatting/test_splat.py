@@ -511,7 +511,7 @@ def test_two_key_sort_makes_the_same_lists(monkeypatch):
 @pytest.mark.parametrize(
     "together", [pytest.param(2, marks=pytest.mark.slow), 5, pytest.param(100, marks=pytest.mark.slow)]
 )
-def test_tiles_walked_together_draw_the_same(together):
+def test_tiles_composited_together_draw_the_same(together):
     scene, camera = make_scene(count=100)
     gaussians = gaussians_of(scene)
 
@@ -544,7 +544,7 @@ def test_two_devices_draw_what_one_draws(two_devices):
 
 
 @pytest.mark.parametrize("outputs", [("rgb", "alpha"), ("surface_depth", "depth")])
-def test_both_ways_of_blending_draw_the_same(outputs):
+def test_both_compositors_draw_the_same(outputs):
     scene, camera = make_scene(count=150)
     gaussians = gaussians_of(scene)
     loops = render(gaussians, camera, outputs=outputs)
@@ -626,7 +626,7 @@ def test_pictures_and_gradients_are_those_of_the_form_for_accelerators(x64, monk
     gaussians = gaussians_of(scene)
 
     def both():
-        jax.clear_caches()  # what was traced with the other form
+        jax.clear_caches()  # the trace of the other form
         return jax.jit(jax.value_and_grad(lambda g: (render(g, camera, outputs=("rgb",)).rgb ** 2).sum()))(gaussians)
 
     on_cpu = both()

@@ -25,6 +25,7 @@ def unannotated(path):
     """Functions with an argument or a result without annotation, and arrays without shape."""
     for function in functions_of(ast.parse(path.read_text())):
         arguments = function.args.posonlyargs + function.args.args + function.args.kwonlyargs
+        arguments += [argument for argument in (function.args.vararg, function.args.kwarg) if argument]
         hints = [argument.annotation for argument in arguments if argument.arg != "self"]
         if not function.name.startswith("__"):
             hints.append(function.returns)
