@@ -19,10 +19,11 @@ from benchmarks.common.scopes import seconds_by_scope
 from benchmarks.common.timing import in_turn, peak_memory, timed
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, fit_grid, make_particles
-from pigjax.mpm.active_grid import Fit
+from pigjax.mpm.active_grid import ActiveGrid
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.materials import LAWS, Material, material_table
+from pigjax.mpm.program import StepInputs
 from pigjax.mpm.sleep import Sleep, Sleeper
 
 DT = 1e-4  # the rivals' step
@@ -128,11 +129,11 @@ def laws(_):
 
 
 STAGES = {
-    "to_grid": "to the grid: windows are made",
+    "particles_to_grid": "to the grid: windows are made",
     "add_windows": "to the grid: windows are added",
-    "on_grid": "on the grid: velocities, boundaries",
+    "update_grid": "on the grid: velocities, boundaries",
     "take_windows": "to the particles: windows are read",
-    "from_grid": "to the particles: sums over windows",
+    "grid_to_particles": "to the particles: sums over windows",
     "law": "the law, and particles move",
     "health": "health, and states that are not finite",
 }
@@ -233,17 +234,16 @@ def sleep(_):
     x = jnp.where(flying[:, None], (particles.x - 0.35) * 0.5 + jnp.asarray([1.0, 0.4, 0.4]), particles.x)
     v = jnp.where(flying[:, None], jnp.asarray([0.0, 0.0, -1.0]), 0.0)
     particles = eqx.tree_at(lambda p: (p.x, p.v, p.body), particles, (x, v, flying.astype(jnp.int32)))
-    settings, step = SimConfig(devices=1), {"frames": 1, "substeps": 20, "start": jnp.float32(0)}
-    step |= {"dt": jnp.float32(DT), "gravity": jnp.zeros(3), "colliders": (), "contact": None}
+    settings, inputs = SimConfig(devices=1), StepInputs(jnp.float32(DT), 20, jnp.zeros(3), jnp.float32(0))
     print(head("asleep", "ms per frame", "against no sleep", "compile s"))
     base = None
     for name, asleep in (("sleep=None", None), ("none", (0, 0)), ("the block", (1, 0)), ("both", (1, 1))):
-        fit = Fit() if asleep is None else Sleeper(settings=Sleep(), body=np.asarray(particles.body))
+        fit = ActiveGrid() if asleep is None else Sleeper(settings=Sleep(), body=np.asarray(particles.body))
 
         def frame(fit=fit, asleep=asleep):
             if asleep is not None:  # as it was, for each window
                 fit.asleep, fit.still = np.array(asleep, bool), 99 * np.array(asleep)
-            return fit.frame(particles, grid, table, settings, 1, **step)
+            return fit.frame(particles, grid, table, settings, 1, inputs)
 
         found = timed(frame, windows=5)
         base = base or found.seconds

@@ -22,8 +22,8 @@ from matplotlib.figure import Figure
 from benchmarks.common.pages import head, picture, row
 from benchmarks.common.timing import in_turn, measure, peak_memory
 from pigjax import Gaussians, RenderConfig, look_at, render, stack_cameras
-from pigjax.splatting.binning import bands_of, blend_config, front_to_back, list_pass
-from pigjax.splatting.compositor import blend
+from pigjax.splatting.binning import bin_splats, blend_config, list_pass, shards_of
+from pigjax.splatting.compositor import composite
 from pigjax.splatting.projection import project_splats
 from pigjax.splatting.sh import colours
 from pigjax.splatting.sharding import replicate
@@ -53,7 +53,7 @@ def ball(count, width, height):
 def shared(count, width, height, devices):
     """The ball on each of so many devices, and the setting with which they share its image."""
     scene, config = ball(count, width, height), RenderConfig(bands=devices)
-    return config, replicate(scene, bands_of(scene[1], config))
+    return config, replicate(scene, shards_of(scene[1], config))
 
 
 def loss(gaussians, camera, config):
@@ -126,11 +126,15 @@ def seconds_of_stages(count, width, height):
     pose = measure(as_splats, gaussians)
     project = measure(lambda s, c: project_splats(s, c, config), pose.result, camera)
     colour = measure(colours, pose.result, camera)
-    order = measure(lambda p: front_to_back(p, blending), project.result)
+    order = measure(lambda p: bin_splats(p, blending), project.result)
     shapes, tiles = project.result.shapes[order.result.order], jnp.ones(blending.tiles, bool)
     first = measure(lambda s, b, t: list_pass(s, b, 0, t, blending, blending.slots), shapes, order.result, tiles)
-    whole = measure(lambda p, f: blend(p, f, blending)[:2], project.result, colour.result)
-    slope = jax.grad(lambda p, f: jnp.sum(blend(p, f, blending).features ** 2), argnums=1)
+
+    def drawn(projected, features):
+        return composite(projected, features, bin_splats(projected, blending), blending)
+
+    whole = measure(lambda p, f: drawn(p, f)[:2], project.result, colour.result)
+    slope = jax.grad(lambda p, f: jnp.sum(drawn(p, f).features ** 2), argnums=1)
     backward = measure(slope, project.result, colour.result)
     return [run.seconds for run in (pose, project, colour, order, first, whole, backward)]
 

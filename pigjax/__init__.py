@@ -1,8 +1,8 @@
 """pigjax: differentiable physics in 3D Gaussian splat scenes.
 
-The way of the data: files (`io`) → Gaussians (`reconstruct`, `splat`) → objects (`segmentation`) → matter (`particles`,
-`mls_mpm`, `materials`, `colliders`) → posed splats (`clamp`) → pictures (`splat`) → video. `scene` runs all of it from
-one file.
+Pipeline: files (`io`) → Gaussians (`reconstruction`, or a trained file) → objects (`segmentation`) → particles
+(`coupling.seeding`) → simulation (`mls_mpm`) → posed splats (`coupling.binding`, `clamp`) → pictures (`splat`) → video.
+`scene` runs all of it from one file; `study` varies its parameters.
 """
 
 from pigjax.clamp import ClampParams, eigen_clamp

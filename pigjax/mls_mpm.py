@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import jax
@@ -21,10 +20,11 @@ from pigjax.core.arguments import checked
 from pigjax.core.arrays import is_known
 from pigjax.core.errors import InputError
 from pigjax.mpm import Grid, Health, Particles, SimConfig, StepHealth, Trajectory
-from pigjax.mpm.active_grid import run_in_boxes, run_in_one_box
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.materials import MaterialTable
+from pigjax.mpm.program import StepInputs
+from pigjax.mpm.simulate import collect, simulate, simulate_compiled
 from pigjax.mpm.sleep import Sleep, Sleeper
 from pigjax.mpm.timestep import (
     Vector,
@@ -33,14 +33,13 @@ from pigjax.mpm.timestep import (
     check_steps,
     choose_integrator,
     choose_substeps,
-    first_substeps,
-    frame_substeps,
-    is_open,
     longest_step,
     stable_dt,
+    substep_rule,
 )
 
 __all__ = ["SimConfig", "choose_integrator", "choose_substeps", "rollout", "stable_dt", "step"]
+_SMALL = 50_000  # nodes of a domain that is held whole: less than other costs of a step
 _UNDECIDED = (
     "is traced by jit, grad or vmap and cannot choose its integrator: give SimConfig one, or what choose_integrator"
     " finds from concrete values."
@@ -81,7 +80,7 @@ def step(
         check_dt(float(dt), particles, grid, table, config, colliders)
     elif config.integrator == "auto":
         raise InputError(f"step {_UNDECIDED}")
-    end, _, health = _in_one_box(particles, grid, table, config, dt, (gravity, colliders, contact), 1, 1)
+    end, _, health = _compiled(particles, grid, table, config, dt, gravity, colliders, contact, 1, 1)
     return end, health
 
 
@@ -116,47 +115,45 @@ def rollout(
     _check_table(particles, table)
     _check_contact(particles, config, contact)
     check_steps(frames, frame_dt, gravity)
-    substeps = config.substeps
-    steps: dict[str, Any] = {"frames": frames, "frame_dt": frame_dt, "gravity": gravity, "colliders": colliders}
-    if not is_known(particles, grid, table, frame_dt, gravity, colliders, contact):
+    shared = (particles, grid, table, frame_dt, gravity, colliders, contact)
+    if not is_known(shared):
         if sleep is not None:
             raise InputError(
                 "rollout is traced by jit, grad or vmap, where it cannot be decided who sleeps: give sleep=None there."
             )
-        if substeps is None:
+        if config.substeps is None:
             raise InputError(
                 "rollout is traced by jit, grad or vmap and cannot choose its substeps: give SimConfig(substeps=...);"
                 " choose_substeps finds the number from concrete values."
             )
         if config.integrator == "auto":
             raise InputError(f"rollout {_UNDECIDED}")
-        dt = jnp.asarray(frame_dt) / substeps
-        return _in_one_box(particles, grid, table, config, dt, (gravity, colliders, contact), frames, substeps)
-    choose = None
-    if substeps is None:
-        config, substeps = first_substeps(particles, grid, table, config, **steps)
-        if is_open(grid):
-            now: dict[str, Any] = {"frame_dt": float(frame_dt), "gravity": gravity, "colliders": colliders}
-            choose = partial(frame_substeps, substeps, grid=grid, table=table, config=config, **now)
-    else:
-        config = choose_integrator(particles, grid, table, config, **steps)
-    check_dt(float(frame_dt) / substeps, particles, grid, table, config, colliders)
-    shared = _like((grid, table, jnp.asarray(gravity), colliders, contact), particles)
-    grid, table, gravity, colliders, contact = shared
-    end, path, health = run_in_boxes(
-        particles,
-        grid,
-        table,
-        config,
-        frames=frames,
-        frame_dt=_like(frame_dt, particles),
-        gravity=gravity,
-        colliders=colliders,
-        contact=contact,
-        substeps=substeps,
-        choose=choose,
-        fit=None if sleep is None else Sleeper(settings=sleep, body=np.asarray(particles.body)),
+        dt = jnp.asarray(frame_dt) / config.substeps
+        return _compiled(particles, grid, table, config, dt, gravity, colliders, contact, frames, config.substeps)
+    rule = substep_rule(
+        particles, grid, table, config, frames=frames, frame_dt=frame_dt, gravity=gravity, colliders=colliders
     )
+    check_dt(float(frame_dt) / rule.first, particles, grid, table, rule.config, colliders)
+    numbers = (frame_dt, jnp.asarray(gravity), grid, table, colliders, contact)
+    duration, down, grid, table, colliders, contact = _like(numbers, particles)
+    if sleep is None and not rule.adaptive and math.prod(grid.shape) <= _SMALL:
+        inputs = StepInputs(duration / rule.first, rule.first, down, jnp.zeros_like(duration), colliders, contact)
+        whole = replace(rule.config, box=None)
+        end, path, health = simulate_compiled(particles, grid, table, whole, inputs, frames=frames)
+    else:
+        loop = simulate(
+            particles,
+            grid,
+            table,
+            rule,
+            frames=range(frames),
+            frame_dt=duration,
+            gravity=down,
+            colliders=colliders,
+            contact=contact,
+            active_grid=None if sleep is None else Sleeper(settings=sleep, body=np.asarray(particles.body)),
+        )
+        end, path, health = collect(loop, frames)
     if config.walls is None and (hits := int(health.wall_hits)):
         warnings.warn(
             f"{hits} particles met the wall of their grid, which holds them back: give the grid more room (fit_grid's"
@@ -166,30 +163,31 @@ def rollout(
     return end, path, health
 
 
-def _in_one_box(particles, grid, table, config, dt, around, frames, substeps):
-    gravity, colliders, contact = around
-    dt, gravity, colliders, contact = _like((dt, jnp.asarray(gravity), colliders, contact), particles)
-    grid, table = _like((grid, table), particles)
-    return run_in_one_box(
-        particles,
-        grid,
-        table,
-        config,
-        dt=dt,
-        gravity=gravity,
-        colliders=colliders,
-        contact=contact,
-        frames=frames,
-        substeps=substeps,
-    )
+def _compiled(
+    particles: Particles,
+    grid: Grid,
+    table: MaterialTable,
+    config: SimConfig,
+    dt: Any,
+    gravity: Any,
+    colliders: tuple[Collider, ...],
+    contact: BodyContact | None,
+    frames: int,
+    substeps: int,
+) -> tuple[Particles, Trajectory, Health]:
+    """Frames as one program, with numbers in the precision of the particles."""
+    numbers = (dt, jnp.asarray(gravity), grid, table, colliders, contact)
+    dt, gravity, grid, table, colliders, contact = _like(numbers, particles)
+    inputs = StepInputs(dt, substeps, gravity, jnp.zeros_like(dt), colliders, contact)
+    return simulate_compiled(particles, grid, table, config, inputs, frames=frames)
 
 
-def _like(tree, particles):
+def _like(tree: Any, particles: Particles) -> Any:
     """Numbers in the precision of the particles."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, particles.x.dtype), tree)
 
 
-def _check_table(particles, table):
+def _check_table(particles: Particles, table: MaterialTable) -> None:
     if not len(particles):
         raise InputError("there are no particles: a simulation needs one or more.")
     if len(particles.counts) != len(table):
@@ -198,7 +196,7 @@ def _check_table(particles, table):
         )
 
 
-def _check_contact(particles, config, contact):
+def _check_contact(particles: Particles, config: SimConfig, contact: BodyContact | None) -> None:
     if contact is None:
         return
     if config.integrator != "explicit":

@@ -1,8 +1,13 @@
-"""Objects from instance masks: the views vote on the id of every Gaussian (PIG, section 3.2)."""
+"""Objects from instance masks: the views vote on the id of every Gaussian (PIG, section 3.2).
+
+`lift_masks` draws each view's surface depth, lets every Gaussian on that surface vote for the id of its pixel (the
+visible-surface test, `on_surface`), and elects the id with most votes. `object_mask` and `pixel_ids` draw the result.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import equinox as eqx
@@ -14,10 +19,10 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Num
 from scipy.spatial import cKDTree
 
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import Scalar, array_field, in_precision, is_known
+from pigjax.core.arrays import Scalar, array_field, in_precision, is_known, real_field
 from pigjax.core.camera import Camera, project
 from pigjax.core.errors import InputError
-from pigjax.splat import Gaussians, RenderConfig, Splats, pairs_of, render, required_capacity
+from pigjax.splat import Gaussians, RenderConfig, Splats, backproject, pairs_of, render, required_capacity
 from pigjax.splatting.binning import blend_config
 from pigjax.splatting.contributions import credits_of_candidates, soft_surface_depth
 from pigjax.splatting.projection import near_plane, project_splats
@@ -26,7 +31,7 @@ from pigjax.splatting.types import as_splats
 
 _TIED_IDS = 4  # of more ids with equal votes, the lowest four compete
 _MOST_MEMORY = 2**35  # [bytes] of votes; more come from ids that number annotations rather than objects
-_IDS_TOGETHER = 32  # ids credited in one pass of weighting = "alpha", which bounds its memory
+_IDS_TOGETHER = 32  # ids drawn or credited in one pass, which bounds the memory
 
 
 class Labels(eqx.Module):
@@ -34,8 +39,8 @@ class Labels(eqx.Module):
 
     object_id: Int[Array, "n"] = array_field()  # 0 = background or contested, -1 = never seen
     votes: Num[Array, "n m"] = array_field()  # views (or alpha·T, or soft counts) for each id, background in column 0
-    confidence: Float[Array, "n"] = array_field()  # share of the votes that the winner took, 0 where never seen
-    overflow: Int[Array, ""] | None = None  # box/tile pairs that the renderer dropped, over all views
+    confidence: Float[Array, "n"] = real_field()  # share of the votes that the winner took, 0 where never seen
+    overflow: Int[Array, ""] | None = None  # splat/tile pairs that the renderer dropped, over all views
     ids: Int[Array, "m"] | None = None  # id of each column of `votes`; None: column k counts id k
 
 
@@ -60,34 +65,36 @@ def lift_masks(
     """Give every Gaussian the id that most views see at its place (PIG, section 3.2).
 
     In each view a Gaussian at camera depth z whose centre falls in a pixel with surface depth d votes for the id of
-    that pixel if |z - d| <= tau_d·d. Behind the near plane, outside the image or without a surface it has no vote.
+    that pixel if |z - d| <= tau_d·d. A Gaussian behind the near plane, outside the image or in a pixel without a
+    surface has no vote.
 
     Views are streamed: memory is one [n num_ids] array of counts, in the narrowest integer that holds the views.
-    `vmap` over `tau_T` and `tau_d` sweeps them. Soft votes and ties by alpha walk lists of a static capacity, outside
-    `jit` the one that the cameras need; inside, or where `config.capacity` is set, `Labels.overflow` counts what was
-    dropped.
+    `vmap` over `tau_T` and `tau_d` sweeps them. Soft votes and ties by alpha scan lists of a static capacity. Outside
+    `jit` it is the one that the cameras need; inside, or where `config.capacity` is set, `Labels.overflow` counts the
+    splat/tile pairs that were dropped.
 
     Args:
         gaussians: the scene.
         cameras: batch of posed views.
         masks: id of every pixel in every view, 0 = background, the same id for the same object in all views.
-        num_ids: ids run from 0 to num_ids - 1; votes take [n num_ids], so number ids far apart anew (`compact_ids`).
-        tau_T: transmittance below which the surface lies, in [0, 1].
-        tau_d: depth tolerance relative to the surface depth, in [0, 1].
+        num_ids: ids run from 0 to num_ids - 1; votes take [n num_ids], so renumber ids that lie far apart
+            (`compact_ids`).
+        tau_T: transmittance below which the surface lies, in [0, 1]; the default is the paper's.
+        tau_d: depth tolerance relative to the surface depth, in [0, 1]; the default is the paper's.
         temperature: None for the hard vote; a positive number makes both tests sigmoids of that width (in units of
             transmittance and of relative depth), votes soft counts, and `votes` and `confidence` differentiable with
-            respect to tau_T, tau_d, Gaussians and cameras. What stays discrete is the pixel that a centre falls in.
+            respect to tau_T, tau_d, Gaussians and cameras. The pixel that a centre falls in stays discrete.
         background: "ignore" lets id 0 win only where no object has a vote; "vote" lets it compete.
         weighting: "centre" is the paper's vote; "alpha" instead credits each Gaussian with the alpha·T that it has in
             the pixels of each id (FlashSplat's statistic; Shen et al. 2024), without thresholds.
         ties: between ids with equal votes, "alpha" prefers the larger sum of alpha·T over the pixels of all views,
             which costs a second pass over the tiles that hold tied Gaussians; "lowest" takes the lowest id at once.
-            Equal again: the lowest non-zero id. Soft counts and sums of alpha·T are not settled further.
+            Equal sums go to the lowest non-zero id. Ties of soft counts or of sums of alpha·T go to the lowest id.
         min_votes: with fewer votes than this (soft counts are rounded) a Gaussian stays unseen, id -1.
         purity: with a smaller share of the votes than this the winner is contested, and the id is 0.
         min_seen: with weighting = "alpha", a Gaussian whose alpha·T is a smaller share than this of the alpha of its
             whole footprints stays unseen, id -1: it is hidden nearly everywhere, so it may reach through a surface.
-            None asks nothing. For objects without fringes 0.05 with purity = 0.6 serves well.
+            None, the default, tests nothing; 0.05 with purity = 0.6 gives objects without fringes.
         config: the renderer's settings.
 
     Raises:
@@ -114,13 +121,13 @@ def lift_masks(
     thresholds = jnp.asarray(tau_T, dtype), jnp.asarray(tau_d, dtype), temperature
     settled = weighting == "centre" and temperature is None and ties == "alpha"
     splats, masks, cameras = as_splats(gaussians), jnp.asarray(masks), in_precision(cameras, dtype)
-    walks = enough_capacity(gaussians, cameras, config) if settled or temperature is not None else config
-    drawn = config if temperature is None else walks
+    scanned = enough_capacity(gaussians, cameras, config) if settled or temperature is not None else config
+    drawn = config if temperature is None else scanned
     votes, overflow = _collect(splats, cameras, masks, thresholds, num_ids, weighting, drawn)
-    if settled and (walks is config):
-        overflow += _left_out(splats, cameras, walks)
-    rerun = jax.tree_util.Partial(_credit_candidates, splats, cameras, masks, walks)
-    object_id, confidence = _elect(votes, background, min_votes, purity, rerun if settled else None)
+    if settled and scanned is config:
+        overflow += _left_out(splats, cameras, scanned)
+    break_ties = jax.tree_util.Partial(_credit_candidates, splats, cameras, masks, scanned)
+    object_id, confidence = _elect(votes, background, min_votes, purity, break_ties if settled else None)
     if min_seen is not None:
         hidden = jnp.sum(votes, 1) < min_seen * _whole_footprints(splats, cameras, config)
         object_id, confidence = jnp.where(hidden, -1, object_id), jnp.where(hidden, 0.0, confidence)
@@ -141,7 +148,7 @@ def object_mask(
 
     Args:
         gaussians: the scene.
-        labels: as `lift_masks` gives them.
+        labels: of `lift_masks`.
         object_id: the object; may be swept.
         camera: a single camera.
         mode: "isolated" draws the object's Gaussians alone, also where others hide it; "visible" is the object's share
@@ -160,12 +167,66 @@ def object_mask(
     return draw("object_weights", splats, camera, config, object_weights=member[:, None])[0][..., 0]
 
 
+def pixel_ids(
+    gaussians: Gaussians | Splats,
+    labels: Labels,
+    camera: Camera,
+    *,
+    keep: Sequence[int] = (),
+    config: RenderConfig = RenderConfig(),
+) -> tuple[Int[np.ndarray, "h w"], dict[int, Float[np.ndarray, "h w"]]]:
+    """The id with the largest share of each pixel, and the shares of chosen ids. Host.
+
+    The share of the background, id 0, is that of its Gaussians, of those never seen, and of the light that passes all
+    Gaussians. Ids are drawn 32 at a time, so that memory does not grow with their number; equal shares go to the lowest
+    id.
+
+    Args:
+        gaussians: the scene.
+        labels: object of each Gaussian.
+        camera: a single camera.
+        keep: ids whose shares are returned.
+        config: the renderer's settings.
+    """
+    splats = as_splats(gaussians)
+    object_id = jnp.maximum(jnp.asarray(labels.object_id), 0)
+    present = np.unique(np.append(0, np.asarray(object_id)))
+    together = min(len(present), _IDS_TOGETHER)
+    groups = np.full((-(-len(present) // together), together), -1)
+    groups.ravel()[: len(present)] = present
+    best = jnp.full((camera.height, camera.width), -1.0, splats.means.dtype)
+    winner = jnp.zeros((camera.height, camera.width), int)
+    shares: dict[int, np.ndarray] = {}
+    for group in groups:
+        weights, alpha = _shares(splats, object_id, jnp.asarray(group), camera, config)
+        weights = weights.at[..., 0].add(jnp.where(group[0] == 0, 1 - alpha, 0.0))
+        shares |= {int(number): np.asarray(weights[..., i]) for i, number in enumerate(group) if number in keep}
+        largest, here = jnp.max(weights, -1), jnp.asarray(group)[jnp.argmax(weights, -1)]
+        winner, best = jnp.where(largest > best, here, winner), jnp.maximum(largest, best)
+    return np.asarray(winner), shares
+
+
+@eqx.filter_jit
+def _shares(splats: Splats, object_id, group, camera: Camera, config: RenderConfig):
+    """Share [h w m] of each id of the group, and the coverage [h w] of all splats."""
+    membership = (object_id[:, None] == group).astype(splats.opacities.dtype)
+    frame = render(splats, camera, config, outputs=("alpha", "object_weights"), object_weights=membership)
+    return frame.object_weights, frame.alpha
+
+
 @checked
 def fill_unseen(gaussians: Gaussians | Splats, labels: Labels, k: int = 8) -> Labels:
-    """Give Gaussians that no view saw (id -1) the commonest id among their k nearest seen ones, host.
+    """Give Gaussians that no view saw (id -1) the commonest id among their k nearest seen ones. Host.
 
-    The nearest neighbour decides ties. The confidence of a filled Gaussian is its neighbours' agreement. A Gaussian
-    whose mean is not finite is nobody's neighbour, and stays as it was.
+    The nearest neighbour decides ties. A Gaussian whose mean is not finite is no neighbour, and keeps its id.
+
+    Args:
+        gaussians: the scene.
+        labels: of `lift_masks`.
+        k: number of neighbours; 8, about those that touch a Gaussian on a surface.
+
+    Returns:
+        Labels in which the confidence of a filled Gaussian is the share of its neighbours that agree.
 
     Raises:
         InputError: no Gaussian was seen, or k < 1.
@@ -198,7 +259,12 @@ def fill_unseen(gaussians: Gaussians | Splats, labels: Labels, k: int = 8) -> La
 def enough_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: RenderConfig) -> RenderConfig:
     """The same settings with the capacity that these cameras need, rounded up to a power of two.
 
-    Left alone where the capacity was set by the caller or where inputs are traced, since shapes are static there.
+    They are returned unchanged where a capacity is set, and where inputs are traced, since shapes are static there.
+
+    Args:
+        gaussians: the scene.
+        cameras: batch of views.
+        config: the renderer's settings.
     """
     if config.capacity is not None or not all(map(is_known, jax.tree.leaves((gaussians, cameras)))):
         return config
@@ -209,7 +275,7 @@ def enough_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: Rend
 
 @eqx.filter_jit
 def _collect(splats, cameras, masks, thresholds, num_ids, weighting, config):
-    """Votes [n m] of all views, and the pairs that the renderer dropped."""
+    """Votes [n m] of all views, and the splat/tile pairs that the renderer dropped."""
     tau_T, tau_d, temperature = thresholds
     if weighting == "alpha":
         dtype = splats.means.dtype
@@ -222,7 +288,7 @@ def _collect(splats, cameras, masks, thresholds, num_ids, weighting, config):
         dtype = np.min_scalar_type(len(cameras))
 
         def count(votes, camera, mask):
-            pixel, seen, overflow = front_of(splats, camera, tau_T, tau_d, config)
+            pixel, seen, overflow = on_surface(splats, camera, tau_T, tau_d, config)
             return _cast(votes, mask.ravel()[pixel], seen), overflow
 
     else:
@@ -243,7 +309,7 @@ def _collect(splats, cameras, masks, thresholds, num_ids, weighting, config):
 
 @eqx.filter_jit
 def _left_out(splats: Splats, cameras: Camera, config: RenderConfig):
-    """Pairs that the walk over tied Gaussians drops for want of capacity, over all views."""
+    """Splat/tile pairs that the scan for tied Gaussians drops for want of capacity, over all views."""
 
     def of_view(camera):
         slots = static_capacity(len(splats), blend_config(camera, config, len(splats), surface=True))
@@ -268,7 +334,7 @@ def _whole_footprints(splats: Splats, cameras: Camera, config: RenderConfig) -> 
 
 
 def _soft_votes(splats: Splats, camera: Camera, tau_T, tau_d, temperature, config: RenderConfig):
-    """As `front_of`, with a weight between 0 and 1 in place of yes and no."""
+    """As `on_surface`, with a weight between 0 and 1 instead of a boolean."""
     depth, presence, overflow = soft_surface_depth(splats, camera, config, tau_T=tau_T, temperature=temperature)
     pixel, z, inside = pixel_under(splats, camera, config)
     depth = depth.ravel()[pixel]
@@ -277,7 +343,7 @@ def _soft_votes(splats: Splats, camera: Camera, tau_T, tau_d, temperature, confi
 
 
 def _cast(votes, ids, weight):
-    """Add one vote per Gaussian."""
+    """Votes [n m] with one more for each Gaussian, of its id and weight."""
     rows = jnp.arange(votes.shape[0])
     return votes.at[rows, ids].add(weight.astype(votes.dtype), mode="drop", unique_indices=True)
 
@@ -293,17 +359,12 @@ def _credit_candidates(splats: Splats, cameras: Camera, masks, config: RenderCon
 
 
 def _credits(splats: Splats, camera: Camera, mask, num_ids: int, config: RenderConfig):
-    """Sum of alpha·T over the pixels of each id [n m]: drawing is linear in the weights, and this is its transpose."""
-    reverse = dataclasses.replace(config, differentiation="reverse")
+    """Sum of alpha·T over the pixels of each id [n m], and the pairs dropped; 32 ids at a time bound the memory."""
     together = min(num_ids, _IDS_TOGETHER)
 
     def of_ids(first):
-        def blend(weights):
-            return draw("object_weights", splats, camera, reverse, object_weights=weights)
-
-        weights = jnp.zeros((len(splats), together), splats.means.dtype)
-        _, transpose, overflow = jax.vjp(blend, weights, has_aux=True)
-        return transpose(jax.nn.one_hot(mask - first, together, dtype=weights.dtype))[0], overflow
+        members = jax.nn.one_hot(mask - first, together, dtype=splats.means.dtype)
+        return backproject(splats, camera, members, config)
 
     if together == num_ids:
         return of_ids(0)
@@ -376,15 +437,27 @@ def _check_ids(masks, num_ids: int, count: int, views: int) -> None:
         )
 
 
-def front_of(
+def on_surface(
     splats: Splats, camera: Camera, tau_T: Scalar, tau_d: Scalar, config: RenderConfig
 ) -> tuple[Int[Array, "n"], Bool[Array, "n"], Int[Array, ""]]:
-    """The pixel under each centre, whether the centre lies on the surface there, and the pairs dropped."""
+    """The visible-surface test (PIG, section 3.2): |z - d| <= tau_d·d at the pixel under each centre.
+
+    Args:
+        splats: the scene.
+        camera: a single camera.
+        tau_T: transmittance below which the surface lies, in [0, 1].
+        tau_d: depth tolerance relative to the surface depth d, in [0, 1].
+        config: the renderer's settings.
+
+    Returns:
+        Flat index of the pixel under each centre, whether the centre lies on the surface there, and the splat/tile
+        pairs dropped.
+    """
     reverse = dataclasses.replace(config, differentiation="reverse")  # nothing to differentiate, and never short
     depth, overflow = draw("surface_depth", splats, camera, reverse, tau_T=tau_T)
     pixel, z, inside = pixel_under(splats, camera, config)
     depth = depth.ravel()[pixel]
-    # where there is no surface the depth is NaN, and no comparison holds
+    # without a surface the depth is NaN, and no comparison holds
     return pixel, inside & (jnp.abs(z - depth) <= depth * tau_d), overflow
 
 
@@ -401,7 +474,7 @@ def pixel_under(
 
 @eqx.filter_jit
 def draw(output: str, splats: Splats, camera: Camera, config: RenderConfig, **options) -> tuple[Array, Array]:
-    """One output of the renderer, and the pairs that it dropped."""
+    """One output of the renderer, and the splat/tile pairs that it dropped."""
     frame: Any = render(splats, camera, config, outputs=(output,), **options)
     return getattr(frame, output), frame.overflow
 

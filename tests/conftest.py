@@ -1,8 +1,10 @@
 """Every test runs with jaxtyping + beartype on the whole package, and with strict JAX modes."""
 
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import jax
@@ -21,12 +23,20 @@ QUICK = (
 )
 ACCEPTED = "PIGJAX_TEST_XLA_FLAGS"  # tells the workers of pytest-xdist what the first process found
 
+# One cache of compiled programs for all workers, notebooks and commands of a run: many tests compile the same scene.
+CACHE = {
+    "JAX_COMPILATION_CACHE_DIR": "pigjax-tests-",
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
+    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+}
+
 jax.config.update("jax_numpy_rank_promotion", "allow")
 jax.config.update("jax_num_cpu_devices", 2)  # for what several devices share
 
 
 def pytest_configure(config):
     """Start JAX: it reads the flags, and commands that a test starts do not see them. Those given from outside win."""
+    share_compiled_programs(config)
     given = os.environ.get("XLA_FLAGS")
     if config.option.markexpr == "not slow":
         if ACCEPTED not in os.environ:
@@ -37,6 +47,18 @@ def pytest_configure(config):
         os.environ.pop("XLA_FLAGS", None)
     else:
         os.environ["XLA_FLAGS"] = given
+
+
+def share_compiled_programs(config):
+    """Make the cache, unless one is given from outside, and tell JAX, which has read its environment already."""
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        folder = tempfile.mkdtemp(prefix=CACHE["JAX_COMPILATION_CACHE_DIR"])
+        os.environ.update({**CACHE, "JAX_COMPILATION_CACHE_DIR": folder})
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+    jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+    for name in ("MIN_COMPILE_TIME_SECS", "MIN_ENTRY_SIZE_BYTES"):
+        if (value := os.environ.get(f"JAX_PERSISTENT_CACHE_{name}")) is not None:
+            jax.config.update(f"jax_persistent_cache_{name.lower()}", float(value) if "TIME" in name else int(value))
 
 
 def accepted_flags(flags):

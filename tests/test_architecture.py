@@ -105,12 +105,12 @@ def test_only_io_touches_files():
                     )
 
 
-CONTRIBUTING = PACKAGE.parent / "CONTRIBUTING.md"
+PAGE = PACKAGE.parent / "docs" / "ARCHITECTURE.md"
 
 
 def layers_as_text():
-    """The table of layers that CONTRIBUTING.md holds: `python tests/test_architecture.py` writes it there."""
-    rows = ["| layer | module | what it is |", "|---|---|---|"]
+    """The table of layers in docs/ARCHITECTURE.md: `python tests/test_architecture.py` writes it there."""
+    rows = ["| layer | module | content |", "|---|---|---|"]
     for layer, modules in reversed(list(enumerate(LAYERS))):
         for module in sorted(modules):
             package = PACKAGE / module / "__init__.py"
@@ -120,8 +120,8 @@ def layers_as_text():
     return "\n".join(rows)
 
 
-def test_contributing_prints_the_layers():
-    assert layers_as_text() in CONTRIBUTING.read_text(), "run python tests/test_architecture.py"
+def test_the_page_on_architecture_prints_the_layers():
+    assert layers_as_text() in PAGE.read_text(), "run python tests/test_architecture.py"
 
 
 def test_products_keep_full_precision():
@@ -167,5 +167,5 @@ def test_every_public_name_has_a_docstring():
 
 
 if __name__ == "__main__":
-    before, _, rest = CONTRIBUTING.read_text().partition("| layer |")
-    CONTRIBUTING.write_text(before + layers_as_text() + "\n" + rest[rest.index("\n\n") + 1 :])
+    before, _, rest = PAGE.read_text().partition("| layer |")
+    PAGE.write_text(before + layers_as_text() + "\n" + rest[rest.index("\n\n") + 1 :])

@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from dense import dense_render
 from facing import ONES, facing_camera, lift, opaque
+from splats import dense, gaussians_of
 
 from pigjax.core.camera import look_at, stack_cameras
 from pigjax.core.errors import InputError
 from pigjax.io import load_views
-from pigjax.objects.overlay import id_colours, id_image, legend_sheet, overlay
+from pigjax.objects.overlay import id_colours, legend_sheet, overlay
 from pigjax.segmentation import Labels, fill_unseen, lift_masks, object_mask
 from pigjax.splat import Gaussians, RenderConfig, render
 
@@ -41,11 +41,6 @@ def make_scene(count=80, seed=0, views=5):
     return scene, stack_cameras(cameras), np.kron(blocks, np.ones((4, 4), int)).astype(np.int32)
 
 
-def gaussians_of(scene):
-    logit = np.log(scene["opacities"] / (1 - scene["opacities"]))
-    return Gaussians(scene["means"], np.log(scene["scales"]), scene["quats"], logit, scene["sh"])
-
-
 def brute_force(scene, cameras, masks, *, tau_T=0.5, tau_d=0.03):
     """Votes and alpha·T sums by the definition, Gaussian by Gaussian, and how near each test is to its threshold."""
     count = len(scene["means"])
@@ -54,10 +49,7 @@ def brute_force(scene, cameras, masks, *, tau_T=0.5, tau_d=0.03):
         pose, focal, centre = (
             np.asarray(v[view], np.float64) for v in (cameras.world_to_cam, cameras.focal, cameras.centre)
         )
-        _, _, _, surface, weights = dense_render(
-            **scene, view=pose, focal=focal, centre=centre, width=WIDTH, height=HEIGHT,
-            config=CONFIG, tau=tau_T, weights=np.eye(count),
-        )  # fmt: skip
+        *_, surface, weights = dense(scene, cameras[view], CONFIG, tau=tau_T, weights=np.eye(count))
         for id_ in range(NUM_IDS):
             credits[:, id_] += weights[mask == id_].sum(0)
         for i, mean in enumerate(scene["means"]):
@@ -366,11 +358,6 @@ def test_overlay_tints_objects_only_and_ids_have_their_own_colours():
     np.testing.assert_array_equal(outlined[2, 2], plain[2, 2])
     with pytest.raises(InputError, match="ids have size"):
         overlay(image, ids[:3])
-
-
-def test_id_image_is_the_largest_share_where_anything_is_seen():
-    weights = jnp.array([[[0.0, 0.6, 0.3], [0.0, 0.2, 0.2], [0.0, 0.1, 0.8]]])
-    np.testing.assert_array_equal(id_image(weights), [[1, 0, 2]])
 
 
 def test_legend_sheet_has_a_row_per_name_in_its_colour():

@@ -26,8 +26,8 @@ from scipy.special import spence
 from pigjax.core.camera import Camera, to_camera
 from pigjax.core.linalg import quat_to_matrix
 from pigjax.splat import Frame, Gaussians, RenderConfig, Splats
-from pigjax.splatting.binning import blend_config
-from pigjax.splatting.compositor import blend
+from pigjax.splatting.binning import bin_splats, blend_config
+from pigjax.splatting.compositor import composite
 from pigjax.splatting.projection import project_splats
 from pigjax.splatting.sh import colours
 
@@ -156,7 +156,8 @@ def _render_parts(
         depths = to_camera(centres, camera)[parent, 2]
         projected = eqx.tree_at(lambda p: p.depths, projected, depths)
     blending = blend_config(camera, config, len(splats), surface=False)
-    alpha, image, _, overflow = blend(projected, colours(splats, camera), blending, jnp.asarray(0.5), reverse=True)
+    boxes = bin_splats(projected, blending)
+    alpha, image, _, overflow = composite(projected, colours(splats, camera), boxes, blending)
     return Frame(rgb=image + (1 - alpha)[..., None] * background, alpha=alpha, overflow=overflow)
 
 

@@ -1,6 +1,7 @@
 """Damage to files: to bytes, to numbers in text, and to the structure of JSON, TOML, NumPy arrays and images."""
 
 import gzip
+import hashlib
 import io
 import json
 import re
@@ -196,6 +197,19 @@ def _npz(data, rng):
     return file.getvalue()
 
 
+def _checkpoint(data, rng):
+    """Another content below a checksum that fits it, which only readers of the content can refuse."""
+    head, _, payload = data.partition(b"\n")
+    parts = json.loads(head)["parts"]
+    if rng.random() < 0.2:
+        parts = _restructured({"parts": parts}, rng)
+    else:
+        payload = _bytes(payload, rng) if rng.random() < 0.7 else _number(payload, rng)
+    known = sorted(parts.items()) if isinstance(parts, dict) else []
+    sha256 = hashlib.sha256(json.dumps(known).encode() + payload).hexdigest()
+    return json.dumps({"sha256": sha256, "parts": parts}).encode() + b"\n" + payload
+
+
 def _gzipped(data, rng):
     if data[:2] != b"\x1f\x8b":
         return _bytes(data, rng)
@@ -240,4 +254,5 @@ def _ply(data, rng):
 
 _BY_SUFFIX = {
     ".json": _json, ".toml": _toml, ".npy": _npy, ".npz": _npz, ".spz": _gzipped, ".png": _png, ".ply": _ply,
+    ".ckpt": _checkpoint,
 }  # fmt: skip

@@ -55,7 +55,7 @@ def _jobs(count, names):
     total = sum(reader.share for reader in chosen.values())
     jobs = []
     for name, reader in chosen.items():
-        jobs += [(name, k) for k in range(max(round(count * reader.share / total), 1))]
+        jobs += [(name, k) for k in range(-(-count * reader.share // total))]
     return jobs
 
 

@@ -7,8 +7,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from PIL import Image
 
 from pigjax import io
@@ -17,6 +19,8 @@ from pigjax.scene import load_scene
 from pigjax.splat import Gaussians
 from pigjax.study import load_study
 from pigjax.study.optimize import Table, load_table
+from pigjax.study.optimize.fit import _State
+from pigjax.study.optimize.history import Recorder
 from pigjax.study.optimize.sweep import _Keep
 
 SIZE = (8, 6)  # of photos and masks [px]
@@ -339,6 +343,35 @@ def _read_state(folder: Path) -> Any:
     return io.last_state(folder, signature="s"), io.load_state(folder, 0, signature="s")
 
 
+_START = {"young": jnp.asarray(1.0), "v": jnp.zeros(3)}  # of searches whose checkpoints are read
+
+
+def _search_checkpoint(method: str) -> tuple[Any, Recorder]:
+    """What a checkpoint of 4 steps holds, and the recorder that takes it back."""
+    leaves = jax.tree.leaves(_START)
+    recorder = Recorder(list(_START), [leaf.shape for leaf in leaves], 4)
+    if method == "search":
+        return (np.asarray(0), recorder.arrays()), recorder
+    zero = np.zeros((), np.int64)
+    state = _State(leaves, optax.adam(0.1).init(leaves), leaves, np.asarray(np.inf), np.asarray(1.0), zero, zero, zero)
+    return (np.asarray(0), state, recorder.arrays()), recorder
+
+
+def _write_search(method: str) -> Callable[[Path], None]:
+    return lambda folder: io.save_pytree(folder / "a.ckpt", _search_checkpoint(method)[0], parts={"loss": "'a'"})
+
+
+def _read_search(method: str) -> Callable[[Path], Any]:
+    def read(folder: Path) -> Any:
+        like, recorder = _search_checkpoint(method)
+        found = io.resumed(folder / "a.ckpt", like, parts={"loss": "'a'"})
+        if found is not None:
+            recorder.restore(found[-1], int(found[0]))
+        return recorder.history("steps")
+
+    return read
+
+
 _TREE = {"a": jnp.zeros((3, 2)), "b": jnp.zeros(4, jnp.int32), "c": 1.5}
 
 
@@ -438,6 +471,8 @@ READERS: dict[str, Reader] = {
     "checkpoint": Reader(
         lambda at: io.save_pytree(at / "a.ckpt", _TREE), lambda at: io.load_pytree(_only(at), _TREE), share=20
     ),
+    "fit.ckpt": Reader(_write_search("fit"), _read_search("fit"), "*.ckpt"),
+    "search.ckpt": Reader(_write_search("search"), _read_search("search"), "*.ckpt"),
     "labels.npz": Reader(_labels, _read_labels, share=20),
     "table.npz": Reader(_table, lambda at: load_table(at / "table.npz"), share=20),
 }

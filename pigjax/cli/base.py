@@ -1,4 +1,4 @@
-"""What the commands share: the console, progress bars, devices."""
+"""Shared by the commands: console, progress bars, devices."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Origin = Annotated[
 
 
 def output_path(path: str) -> Path:
-    """What `--out` names: "~" is the home folder; an empty text, as an unset variable of a shell gives it, is refused.
+    """The path that `--out` names: "~" is the home folder; an empty text, as of an unset shell variable, is refused.
 
     Raises:
         InputError: it is empty.

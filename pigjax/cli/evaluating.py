@@ -1,4 +1,4 @@
-"""What `pigjax evaluate` does and leaves: a data set and a scene in, scores and a sheet of masks out."""
+"""`pigjax evaluate`: a data set and a scene in, scores and a sheet of masks out."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import numpy as np
 from pigjax import io
 from pigjax.core.errors import InputError
 from pigjax.core.metrics import mean_iou
-from pigjax.objects.evaluation import Evaluation, evaluate_labels, ground_prompts, pixel_ids, reference_view
+from pigjax.objects.evaluation import Evaluation, evaluate_labels, ground_prompts, reference_view
 from pigjax.objects.lifting import lift
 from pigjax.objects.overlay import comparison_sheet
-from pigjax.segmentation import Labels, fill_unseen
+from pigjax.segmentation import Labels, fill_unseen, pixel_ids
 from pigjax.splat import Gaussians
 
 _MOST_ROWS = 24
 
 
 class Report(NamedTuple):
-    """What was scored, and how prompts found their objects."""
+    """Scores, and how prompts found their objects."""
 
     evaluation: Evaluation
     grounding: str
@@ -39,6 +39,7 @@ def evaluate_files(
     prompts: Path | None = None,
     reference: str | None = None,
     fill: bool = True,
+    origin: tuple[float, float, float] | None = None,
     progress: Callable[[str, int, int], None] = lambda stage, done, of: None,
     overwrite: bool = False,
     **settings: Any,
@@ -55,12 +56,14 @@ def evaluate_files(
         reference: name of that view, which also overrules the data set's names; if not given, the view with most
             prompts.
         fill: give Gaussians that no view saw the id of their neighbours.
+        origin: what was subtracted from the scene's positions [m]. With one, labels are not compared with the Gaussians
+            of their file, whose positions these no longer are. None: nothing was.
         progress: called with the stage, steps done and of all.
         overwrite: replace scores of something else in `out`, instead of refusing them.
         settings: of `lift_masks`.
 
     Raises:
-        StaleError: `out` holds scores of other Gaussians, another data set or other settings; it names what changed.
+        StaleError: `out` holds scores of other Gaussians, another data set or other settings; it names the changes.
         InputError: files that do not fit each other, or cannot be written.
     """
     out = io.output_folder(out, files=("scores.json", "sheet.png"))
@@ -78,7 +81,8 @@ def evaluate_files(
     if labels is None:
         lifted = _lift(gaussians, dataset, fill=fill, **settings)
     else:
-        stored = io.load_labels(labels, len(gaussians), scene=io.digest_of_scene(gaussians))
+        scene = io.digest_of_scene(gaussians) if origin is None else None
+        stored = io.load_labels(labels, len(gaussians), scene=scene)
         lifted = Labels(
             jnp.asarray(stored.object_id),
             jnp.asarray(stored.votes),
@@ -163,7 +167,7 @@ def _as_json(report: Report) -> dict[str, Any]:
 
 
 def _rows(dataset: io.Dataset, evaluation: Evaluation) -> Iterable[tuple[str, Any, Any, Any]]:
-    """Rows of the sheet, what is visible of the object: at most 24, spread over all views and prompts."""
+    """Rows of the sheet with the visible part of the object: at most 24, spread over all views and prompts."""
     keys = list(dataset.truths)
     chosen = np.unique(np.linspace(0, len(keys) - 1, _MOST_ROWS).astype(int))
     images = dict(zip(dataset.test.names, dataset.test.images))

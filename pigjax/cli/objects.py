@@ -127,7 +127,7 @@ def reconstruct(
 
 
 def _name_of(views: Path) -> str:
-    """Name of the folder of a capture, by which its results are told from those of others."""
+    """Name of the folder of a capture, by which its results differ from those of others."""
     from pigjax import io
 
     home = views.resolve() if views.is_dir() else views.resolve().parent
@@ -136,7 +136,7 @@ def _name_of(views: Path) -> str:
 
 
 def _settings(tau_t: float, tau_d: float, weighting: str, purity: float, min_seen: float | None) -> dict[str, Any]:
-    """Of the vote; what competes with objects by alpha·T is the background too."""
+    """Settings of the vote; with alpha·T the background competes too."""
     background = "vote" if weighting == "alpha" else "ignore"
     thresholds = {"tau_T": tau_t, "tau_d": tau_d, "purity": purity, "min_seen": min_seen}
     return {**thresholds, "weighting": weighting, "background": background}
@@ -200,14 +200,17 @@ def evaluate(
     holes: Annotated[int, typer.Option(help="Close holes of up to this many pixels in the masks.", min=0)] = 0,
     max_size: Annotated[int | None, typer.Option(help="Shrink photos to this many pixels.")] = None,
     drop_invalid: DropInvalid = False,
+    origin: Origin = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Score objects against true masks (mIoU, mBIoU); writes OUT/scores.json and OUT/sheet.png."""
     from pigjax import io
     from pigjax.cli.evaluating import evaluate_files
 
-    cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid)
-    read = io.load_dataset(dataset, layout, masks=masks, vote=labels is None, max_size=max_size, holes=holes)
+    cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid, origin=origin)
+    read = io.load_dataset(
+        dataset, layout, masks=masks, vote=labels is None, max_size=max_size, holes=holes, origin=origin
+    )
     with progress() as bar:
         tasks: dict[str, TaskID] = {}
 
@@ -217,8 +220,8 @@ def evaluate(
             bar.update(tasks[stage], completed=done)
 
         report = evaluate_files(
-            cloud, read, out, labels=labels, prompts=prompts, reference=reference,
-            fill=fill, progress=tell, overwrite=overwrite, **_settings(tau_t, tau_d, weighting, purity, min_seen),
+            cloud, read, out, labels=labels, prompts=prompts, reference=reference, fill=fill,
+            origin=origin, progress=tell, overwrite=overwrite, **_settings(tau_t, tau_d, weighting, purity, min_seen),
         )  # fmt: skip
     scores = report.evaluation.scores
     table = Table("prompt", "object", "views", *(f"{level} mIoU / mBIoU %" for level in scores))

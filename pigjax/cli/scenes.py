@@ -103,10 +103,12 @@ def view(
     path: Annotated[Path, typer.Argument(help="A .ply, .splat or .spz.")],
     out: File = Path("view.mp4"),
     frames: Annotated[int, typer.Option(help="Frames of one round.", min=1)] = 48,
-    size: Annotated[int, typer.Option(help="Edge of the pictures in pixels.", min=16)] = 480,
+    size: Annotated[int, typer.Option(help="Edge of the pictures in pixels.", min=16, max=16384)] = 480,
     elevation: Annotated[float, typer.Option(help="Of the camera, in degrees.", min=-89, max=89)] = 25.0,
     up: Annotated[str, typer.Option(help="Axis of the world that points up: x, y, z, -x, -y, -z.")] = "z",
-    background: Annotated[float, typer.Option(help="Grey level behind the scene: 0 black, 1 white.")] = 1.0,
+    background: Annotated[
+        float, typer.Option(help="Grey level behind the scene: 0 black, 1 white.", min=0, max=1)
+    ] = 1.0,
     drop_invalid: DropInvalid = False,
     origin: Origin = None,
 ) -> None:

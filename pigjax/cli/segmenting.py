@@ -1,4 +1,4 @@
-"""What `pigjax segment` and `pigjax info` leave and say: objects as files, and files in words."""
+"""`pigjax segment` and `pigjax info`: objects as files, and files in words."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from pigjax.core.gaussians import SH_CONSTANT
 from pigjax.io.files import existing
 from pigjax.objects.editing import extract_object, hole_mask, remove_object
 from pigjax.objects.lifting import lift
-from pigjax.objects.overlay import colours_of, id_image, legend_sheet, overlay
+from pigjax.objects.overlay import colours_of, legend_sheet, overlay
 from pigjax.reconstruction.prune import contributions
 from pigjax.scene.schema import load_scene
-from pigjax.segmentation import Labels
+from pigjax.segmentation import Labels, pixel_ids
 from pigjax.splat import Gaussians, render
 from pigjax.splatting.sh import sh_degree_of
 from pigjax.splatting.types import extent_of
@@ -47,7 +47,7 @@ def segment_files(
     """Lift masks and write `labels.npz`, `objects/<id>_<name>.ply`, `coloured.ply` and `objects.png`. Host.
 
     For each object to remove also `removed/<id>_<name>.ply`, the scene without it, `removed/<id>_<name>/<view>.png`,
-    its hole in every view (white: what an inpainter must fill in), and `removed/<id>_<name>.png`, a few views before
+    its hole in every view (white: pixels for an inpainter), and `removed/<id>_<name>.png`, a few views before
     and after with the hole in magenta. Names of objects and views enter names of files by `io.safe_name`, so nothing
     is written outside of these folders.
 
@@ -58,15 +58,15 @@ def segment_files(
         out: folder, made if it is missing.
         fill: give unseen Gaussians the id of their neighbours.
         remove: names or ids of objects.
-        origin: what was subtracted from the scene's positions [m]; the files get it back. None: nothing.
-        overwrite: remove what `out` holds of other Gaussians, views, masks, names or settings, instead of refusing it.
+        origin: offset subtracted from the scene's positions [m], added again in the files; None: none.
+        overwrite: remove results in `out` of other Gaussians, views, masks, names or settings, instead of refusing it.
         settings: of `lift_masks`.
 
     Returns:
         Gaussians of each id.
 
     Raises:
-        StaleError: `out` holds results of something else; it names what changed.
+        StaleError: `out` holds results of other inputs; it names the changes.
         InputError: masks that do not fit the views, files that cannot be written, or an unknown object.
     """
     doomed = [_id_of(name, names) for name in remove]
@@ -85,7 +85,7 @@ def segment_files(
     results = ("labels.npz", "coloured.ply", "objects.png", "objects", "removed")
     io.claim(out, parts, results=results, overwrite=overwrite)
     io.output_folder(out / "objects")
-    train = views.subset("train") if "train" in views.splits else views
+    train = views.training
     assert train.masks is not None
     labels = lift(gaussians, train.cameras, train.masks, fill=fill, **settings)
     object_id = np.asarray(labels.object_id)
@@ -99,7 +99,7 @@ def segment_files(
     colours = colours_of(object_id) / 255
     flat = jnp.asarray((colours - 0.5) / SH_CONSTANT, jnp.float32)[:, None]
     io.save_ply(out / "coloured.ply", eqx.tree_at(lambda g: g.sh, gaussians, flat), origin=origin)
-    io.write_image(out / "objects.png", _sheet(gaussians, views, object_id, names))
+    io.write_image(out / "objects.png", _sheet(gaussians, views, labels, names))
     for number in doomed:
         _remove(gaussians, labels, number, views, out / "removed", _stem(number, names), origin)
     return counts
@@ -115,7 +115,9 @@ def _id_of(name: str, names: dict[int, str]) -> int:
         return found
     if name.isascii() and name.isdecimal() and len(name) <= 10:
         return int(name)
-    raise InputError(f"--remove {name}: {suggest(name, list(names.values())) if names else 'give its id, or names'}.")
+    raise InputError(
+        f"--remove {name[:40]}: {suggest(name, list(names.values())) if names else 'give its id, or names'}."
+    )
 
 
 def _remove(
@@ -135,26 +137,21 @@ def _remove(
     io.write_image(folder / f"{stem}.png", io.contact_sheet(pictures, columns=2))
 
 
-def _sheet(gaussians: Gaussians, views: io.Views, object_id: np.ndarray, names: dict[int, str]) -> np.ndarray:
+def _sheet(gaussians: Gaussians, views: io.Views, labels: Labels, names: dict[int, str]) -> np.ndarray:
     """A few photos with the lifted objects laid over them, and the legend below."""
     chosen = np.unique(np.linspace(0, len(views) - 1, _SHEET_VIEWS).astype(int))
-    ids = np.unique(np.maximum(object_id, 0))
-    membership = jnp.asarray(object_id[:, None] == ids, gaussians.means.dtype)
     tinted, shown = [], []
     for view in chosen:
-        camera = views.cameras[int(view)]
-        frame = render(gaussians, camera, outputs=("object_weights",), object_weights=membership)
-        assert frame.object_weights is not None
-        shown.append(np.asarray(id_image(frame.object_weights, ids=ids)))
+        shown.append(pixel_ids(gaussians, labels, views.cameras[int(view)])[0])
         tinted.append(overlay(views.images[view], shown[-1]))
     sheet = io.contact_sheet(tinted, columns=2)
-    every = {number: names.get(number, "") for number in np.unique(object_id).tolist() if number > 0}
+    every = {number: names.get(number, "") for number in np.unique(labels.object_id).tolist() if number > 0}
     legend = legend_sheet(every, image=views.images[chosen[0]], ids=shown[0], width=sheet.shape[1])
     return np.concatenate([sheet, legend])
 
 
 def describe_file(path: Path) -> dict[str, str]:
-    """What a file holds, in words. Host.
+    """Contents of a file, in words. Host.
 
     Raises:
         MissingFileError: there is no such file.
@@ -216,7 +213,7 @@ def _box(points: np.ndarray) -> str:
 
 
 def _numbers(values: Any, span: Any) -> list[str]:
-    """Values with three digits of what they span, however far from the origin."""
+    """Values with three digits of their span, however far from the origin."""
     largest = max(abs(float(value)) for value in values)
     more = math.ceil(math.log10(largest / span)) if 0 < span < largest < math.inf else 0
     return [f"{value:.{min(3 + more, 15)}g}" for value in values]

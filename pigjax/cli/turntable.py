@@ -11,6 +11,8 @@ import numpy as np
 
 from pigjax import io
 from pigjax.core.camera import Camera, orbit
+from pigjax.core.checks import Limits, shown
+from pigjax.core.errors import InputError
 from pigjax.scene.plan import axis_of
 from pigjax.splat import Gaussians, RenderConfig, render
 from pigjax.splatting.types import extent_of
@@ -44,14 +46,18 @@ def turntable(
         up: axis of the world that points up: x, y, z, -x, -y or -z.
         background: grey level.
         fps: frames a second.
-        progress: told frames done and frames to do.
+        progress: called with frames done and frames to do.
 
     Returns:
         The cameras.
 
     Raises:
-        InputError: unknown suffix or axis, no Gaussian with a finite centre, or the file cannot be written.
+        InputError: unknown suffix or axis, a number out of range, no Gaussian with a finite centre, or the file cannot
+            be written.
     """
+    for name, value, limits in (("background", background, Limits(0, 1)), ("size", size, Limits(1, 16384, unit="px"))):
+        if (rule := limits.broken(value)) is not None:
+            raise InputError(f"turntable: {name} = {shown(value)}: {rule}.")
     extent = extent_of(gaussians)
     single = Path(path).suffix.lower() == ".png"
     cameras = orbit(

@@ -1,1 +1,1 @@
-"""Arrays, errors, checks, 3x3 linear algebra, cameras and metrics: what every other package stands on."""
+"""Arrays, errors, checks, 3x3 linear algebra, cameras and metrics: the basis of every other package."""

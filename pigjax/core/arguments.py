@@ -52,7 +52,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def fits(value: Any, hint: Any) -> bool:
-    """Whether a value is of the kind that an annotation names; what this module cannot tell passes."""
+    """Whether a value is of the kind that an annotation names; annotations that this module cannot judge pass."""
     if hint is Any:
         return True
     origin = get_origin(hint)
@@ -71,7 +71,9 @@ def fits(value: Any, hint: Any) -> bool:
     if issubclass(kind, AbstractArray):
         return _fits_array(value, kind)
     if kind in _NUMBERS:
-        return isinstance(value, _NUMBERS[kind]) or _fits_array(value, None)
+        types, kinds = _NUMBERS[kind]
+        single = getattr(value, "shape", None) == ()
+        return isinstance(value, types) or (single and getattr(getattr(value, "dtype", None), "kind", "-") in kinds)
     if kind is Callable:
         return callable(value)
     if kind is Sequence:
@@ -90,7 +92,7 @@ def _is_sequence(value: Any) -> bool:
 
 
 def _members_fit(value: Any, hint: Any) -> bool:
-    """Whether what a list, a tuple of any length or a mapping holds is of the kind that the annotation names."""
+    """Whether the members of a list, a tuple of any length or a mapping are of the kind that the annotation names."""
     members = get_args(hint)
     if isinstance(value, Mapping) and len(members) == 2:
         return all(fits(member, members[1]) for member in value.values())
@@ -99,15 +101,16 @@ def _members_fit(value: Any, hint: Any) -> bool:
     return True
 
 
-_NUMBERS: dict[type, tuple[type, ...]] = {
-    float: (Real, np.bool_),
-    int: (Integral, np.bool_),
-    bool: (bool, np.bool_),
+# types, and kinds of arrays of no axes ("V": bfloat16)
+_NUMBERS: dict[type, tuple[tuple[type, ...], str]] = {
+    float: ((Real, np.bool_), "biufV"),
+    int: ((Integral, np.bool_), "biu"),
+    bool: ((bool, np.bool_), "b"),
 }
 
 
 def _fits_array(value: Any, hint: Any) -> bool:
-    """Whether a value is an array of numbers with the axes of the hint; without a hint, of a single number."""
+    """Whether a value is an array of numbers with the axes of the hint."""
     if isinstance(value, Real | np.generic):
         return not isinstance(value, np.generic) or value.dtype.kind in "biufcV" if _axes_fit((), hint) else False
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
@@ -117,8 +120,6 @@ def _fits_array(value: Any, hint: Any) -> bool:
 
 
 def _axes_fit(shape: tuple[int, ...], hint: Any) -> bool:
-    if hint is None:
-        return shape == ()
     dims = hint.dims
     variadic = [index for index, dim in enumerate(dims) if not _one_axis(dim)]
     if len(variadic) > 1:

@@ -20,10 +20,35 @@ einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 
 
 def as_array(value: Any) -> Any:
-    """Turn Python floats, sequences and NumPy arrays into JAX arrays; leave tracers, None and axis numbers alone."""
-    if isinstance(value, float | list | tuple | np.ndarray | np.generic):
+    """Turn Python floats, sequences and NumPy arrays into JAX arrays; leave tracers, None and axis numbers alone.
+
+    Integers beyond the range of JAX's become floats, which JAX would otherwise wrap around. What is no array of
+    numbers stays as it is, for the checks of the field.
+    """
+    if not isinstance(value, float | list | tuple | np.ndarray | np.generic):
+        return value
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "iu" and value.size:
+        room = np.iinfo(jax.dtypes.canonicalize_dtype(value.dtype))
+        if value.min() < room.min or value.max() > room.max:
+            return jnp.asarray(value.astype(float))
+    try:
         return jnp.asarray(value)
-    return value
+    except OverflowError:  # a list of integers
+        return jnp.asarray(value, float)
+    except (TypeError, ValueError):
+        return value
+
+
+def as_real_array(value: Any) -> Any:
+    """As `as_array`, with arrays of integers made real: what is computed from them takes their type."""
+    value = as_array(value)
+    return value.astype(float) if isinstance(value, Array) and jnp.issubdtype(value.dtype, jnp.integer) else value
+
+
+def as_real(value: Any) -> Any:
+    """As `as_real_array`, and whole numbers of Python become arrays: for fields that are no axes of a `vmap`."""
+    number = isinstance(value, int) and not isinstance(value, bool)
+    return jnp.asarray(as_float(value)) if number else as_real_array(value)
 
 
 def as_float(value: int | float) -> float:
@@ -40,7 +65,7 @@ def is_known(*trees: Any) -> bool:
 
 
 def in_precision(tree: Any, dtype: Any) -> Any:
-    """The same tree with its real arrays in a precision: what is computed has that of the Gaussians or particles."""
+    """The same tree with its real arrays in a precision, that of the Gaussians or particles."""
 
     def converted(leaf):
         real = isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.floating)
@@ -49,9 +74,14 @@ def in_precision(tree: Any, dtype: Any) -> Any:
     return jax.tree.map(converted, tree)
 
 
-def array_field(*, limits: Any = None, **kwargs: Any) -> Any:
+def array_field(**kwargs: Any) -> Any:
+    """Dynamic field of whole numbers, or of any."""
+    return eqx.field(converter=as_array, **kwargs)
+
+
+def real_field(*, limits: Any = None, **kwargs: Any) -> Any:
     """Dynamic field that a user may sweep; a float given here never recompiles. `check_fields` reads `limits`."""
-    return eqx.field(converter=as_array, metadata={"limits": limits}, **kwargs)
+    return eqx.field(converter=as_real_array, metadata={"limits": limits}, **kwargs)
 
 
 def static_field(*, limits: Any = None, choices: Any = None, **kwargs: Any) -> Any:

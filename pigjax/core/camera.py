@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
+from numbers import Integral
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import Vector, array_field, einsum, in_precision, is_known, matmul, static_field
+from pigjax.core.arrays import Vector, einsum, in_precision, is_known, matmul, real_field, static_field
+from pigjax.core.checks import Limits, check_fields
 from pigjax.core.errors import InputError
 from pigjax.core.linalg import quat_to_matrix
 
@@ -22,13 +24,23 @@ class Camera(eqx.Module):
     """A pinhole camera, x right, y down, z forward, pixel centres at +0.5.
 
     A leading axis on the arrays makes a batch of cameras of one size; `vmap` over it or index it.
+
+    Raises:
+        InputError: an array has not its axes, a number is not finite, or a focal length or a side is not > 0; while
+            tracing no number is known.
     """
 
-    world_to_cam: Float[Array, "*batch 4 4"] = array_field()  # rigid transform [m]
-    focal: Float[Array, "*batch 2"] = array_field()  # [px]
-    centre: Float[Array, "*batch 2"] = array_field()  # principal point [px]
-    width: int = static_field()  # [px]
-    height: int = static_field()  # [px]
+    # rigid transform [m]; NaN: where the camera is is not known, and it sees nothing
+    world_to_cam: Float[Array, "*batch 4 4"] = real_field(limits=Limits(nan=True))
+    focal: Float[Array, "*batch 2"] = real_field(limits=Limits(0, above=True, unit="px"))
+    centre: Float[Array, "*batch 2"] = real_field()  # principal point [px]
+    width: int = static_field(limits=Limits(1, 65536, unit="px"))  # of the image [px]
+    height: int = static_field(limits=Limits(1, 65536, unit="px"))  # of the image [px]
+
+    def __check_init__(self):
+        arrays = (self.world_to_cam, self.focal, self.centre)
+        if not all(axis is None or type(axis) is int for axis in arrays):  # else the axes that jax.vmap is told
+            check_fields(self)
 
     @property
     def position(self) -> Float[Array, "*batch 3"]:
@@ -220,7 +232,7 @@ def orbit(
     around = np.cos(azimuth)[:, None] * first + np.sin(azimuth)[:, None] * np.cross(above, first)
     eyes = np.asarray(target) + radius * (np.cos(elevation) * around + np.sin(elevation) * above)
     look = partial(look_at, target=target, focal=focal, width=width, height=height)
-    # seen from a pole, the axis is the line of sight; the meridian goes on into what is up there
+    # seen from a pole, the axis is the line of sight; the meridian continues into the upward direction
     poles = abs(np.cos(elevation)) < _ALONG
     ups = -np.sign(np.sin(elevation)) * around if poles else np.broadcast_to(above, eyes.shape)
     return stack_cameras([look(eye, up=top) for eye, top in zip(eyes, ups)])
@@ -302,8 +314,10 @@ def _vector(name: str, value: Vector) -> Float[Array, "3"]:
 def _require_image(function: str, focal: float, width: int, height: int) -> None:
     if is_known(focal) and not 0 < float(focal) < np.inf:
         raise InputError(f"{function}: focal = {focal}: must be finite and > 0 px.")
-    if width < 1 or height < 1:
-        raise InputError(f"{function}: width, height = {width}, {height}: an image has at least one pixel.")
+    if not all(isinstance(side, Integral) and not isinstance(side, bool) and side >= 1 for side in (width, height)):
+        raise InputError(
+            f"{function}: width, height = {width}, {height}: whole numbers are needed, at least one pixel."
+        )
 
 
 def _equal(a, b) -> bool:

@@ -93,7 +93,7 @@ LARGEST_WHOLE = 2**31 - 1  # of the integers that arrays hold
 
 
 def check_fields(thing: Any) -> None:
-    """Check every number and choice of a dataclass against its annotation and what `limits`, `choices` say of it.
+    """Check every number and choice of a dataclass against its annotation, `limits` and `choices`.
 
     Numbers without limits must be finite. Arrays that are traced pass.
 
@@ -111,7 +111,7 @@ def check_fields(thing: Any) -> None:
                 raise InputError(f"{name} = {shown(value)}: {suggest(value, choices)}.")
             continue
         kind = next((kind for kind in wanted if kind != "None"), "")
-        if not _is(value, kind):
+        if not _is(value, kind) or _misshapen(value, kind):
             raise InputError(f"{name} = {shown(value)}: must be {_wanted(kind)}.")
         if kind in ("int", "float") or limits is not None or kind.startswith(("Float", "tuple")):
             rule = (limits or (_WHOLE if kind == "int" else ANY)).broken(value)
@@ -138,12 +138,62 @@ def _is(value: Any, kind: str) -> bool:
 
 def is_numeric(value: Any) -> bool:
     """Whether a value is a real number, or an array of them."""
-    return isinstance(value, Real | np.ndarray | jax.Array) and np.asarray(value).dtype.kind in "fiu"
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return jax.dtypes.issubdtype(value.dtype, np.floating) or jax.dtypes.issubdtype(value.dtype, np.integer)
+    return isinstance(value, Real) and np.asarray(value).dtype.kind in "fiu"  # not fractions, nor integers too long
+
+
+def check_axes(thing: Any) -> None:
+    """Check that arrays have the axes of their annotations, and one length where the names of axes are the same.
+
+    What is no array passes, such as None and the axes that `jax.vmap` is told.
+
+    Raises:
+        InputError: an array has other axes, or another length than one before it.
+    """
+    lengths: dict[str, tuple[int, str]] = {}
+    for field in dataclasses.fields(thing):
+        value, kind = getattr(thing, field.name), str(field.type).split(" | ")[0]
+        name = f"{type(thing).__name__}.{field.name}"
+        if not isinstance(value, jax.Array | np.ndarray):
+            if not (value is None or type(value) is int or field.metadata.get("static", False)):
+                raise InputError(f"{name} = {shown(value)}: must be {_wanted(kind)}.")
+            continue
+        if _misshapen(value, kind):
+            raise InputError(f"{name} is of shape {value.shape}: must be {_wanted(kind)}.")
+        for axis, side in zip(_axes_of(kind) or (), value.shape):
+            length, owner = lengths.setdefault(axis, (side, name))
+            if length != side:
+                raise InputError(f"{name} holds {side}, {owner} holds {length}; give as many of each ({axis}).")
+
+
+def _misshapen(value: Any, kind: str) -> bool:
+    """Whether an array has not the axes of its annotation; batches where that begins with "*"."""
+    axes = _axes_of(kind)
+    if axes is None:
+        return False
+    batched = axes[:1] != () and axes[0].startswith("*")
+    fixed = axes[batched:]
+    shape = np.shape(value)
+    if len(shape) < len(fixed) or (not batched and len(shape) > len(fixed)):
+        return True
+    return any(axis.isdecimal() and int(axis) != side for axis, side in zip(fixed[::-1], shape[::-1]))
+
+
+def _axes_of(kind: str) -> tuple[str, ...] | None:
+    """Names or lengths of the axes in an annotation such as "Float[Array, '*batch 4 4']"; None for what is no array."""
+    found = re.fullmatch(r"(?:Float|Int)\[\w+, ['\"]([^'\"]*)['\"]\]", kind)
+    return None if found is None else tuple(found[1].split())
 
 
 def _wanted(kind: str) -> str:
     if kind.startswith("tuple["):
         return f"{kind.count(',') + 1} numbers"
+    axes = _axes_of(kind)
+    if axes == ():
+        return "one number"
+    if axes and (fixed := [axis for axis in axes if not axis.startswith("*")]):
+        return f"an array of numbers [{' '.join(fixed)}]" + (", or a batch of them" if len(fixed) < len(axes) else "")
     return _KINDS.get(kind, "a number, or an array of numbers")
 
 

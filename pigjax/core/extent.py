@@ -19,7 +19,7 @@ _GRAINS = 3.0  # standard deviations of a splat that are seen: the radius of a s
 
 
 class Extent(NamedTuple):
-    """Where a scene is and how large: of its dense core, whatever floats beyond."""
+    """Place and size of a scene's dense core, without floaters."""
 
     centre: Float[np.ndarray, "3"]  # median of the core [m]
     radius: float  # 95 % of the core lie within it [m]; always > 0
@@ -30,7 +30,7 @@ class Extent(NamedTuple):
 
     @property
     def outliers(self) -> int:
-        """Points that are no part of the core: floaters, what is nearly transparent, and what is not finite."""
+        """Number of points outside the core: floaters, and nearly transparent or non-finite ones."""
         return int((~self.core).sum())
 
 

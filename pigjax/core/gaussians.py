@@ -5,19 +5,23 @@ from __future__ import annotations
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from pigjax.core.arrays import array_field
+from pigjax.core.arrays import real_field
+from pigjax.core.checks import check_axes
 
 SH_CONSTANT = 0.28209479177387814  # the spherical harmonic of degree 0, 1 / (2 √π)
 
 
 class Gaussians(eqx.Module):
-    """Trainable 3D Gaussians, parametrised as in 3DGS."""
+    """Trainable 3D Gaussians, parametrised as in 3DGS (Kerbl et al. 2023)."""
 
-    means: Float[Array, "n 3"] = array_field()  # [m]
-    log_scales: Float[Array, "n 3"] = array_field()  # log of standard deviations in m
-    quats: Float[Array, "n 4"] = array_field()  # wxyz, any length; zero means no rotation
-    logit_opacities: Float[Array, "n"] = array_field()
-    sh: Float[Array, "n k 3"] = array_field()  # spherical harmonics, k = (degree + 1)²
+    means: Float[Array, "n 3"] = real_field()  # [m]
+    log_scales: Float[Array, "n 3"] = real_field()  # log of standard deviations in m
+    quats: Float[Array, "n 4"] = real_field()  # wxyz, any length; zero means no rotation
+    logit_opacities: Float[Array, "n"] = real_field()  # sigmoid gives the opacity in (0, 1)
+    sh: Float[Array, "n k 3"] = real_field()  # spherical harmonics, k = (degree + 1)²
+
+    def __check_init__(self):
+        check_axes(self)
 
     def __len__(self) -> int:
         return self.means.shape[0]

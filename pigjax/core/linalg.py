@@ -50,7 +50,7 @@ def polar(matrix: Matrices) -> tuple[Matrices, Matrices]:
 def aligned_svd(matrix: Matrices) -> tuple[Matrices, Vectors, Matrices]:
     """The singular value decomposition whose v is nearest to the identity: axes keep their column's place.
 
-    Of the 24 ways to order and orient the axes properly, the one with the largest trace of v. Permuting or negating
+    Of the 24 proper orders and orientations of the axes, the one with the largest trace of v. Permuting or negating
     columns of the matrix permutes or negates the axes with them. One of `s` is negative where the determinant is.
     """
     u, s, v = svd(matrix)

@@ -25,7 +25,7 @@ Mask = Bool[Array, "... _ _"] | Num[Array, "... _ _"] | Bool[np.ndarray, "... _ 
 
 @checked
 def psnr(a: Float[Array, "h w *c"], b: Float[Array, "h w *c"]) -> Float[Array, ""]:
-    """Peak signal-to-noise ratio [dB] of images in [0, 1]; inf where they are equal.
+    """Peak signal-to-noise ratio [dB] of images `a` and `b` in [0, 1]; inf where they are equal.
 
     Raises:
         InputError: the images differ in shape, or hold integers.
@@ -37,7 +37,7 @@ def psnr(a: Float[Array, "h w *c"], b: Float[Array, "h w *c"]) -> Float[Array, "
 @checked
 @jax.jit
 def ssim(a: Float[Array, "h w *c"], b: Float[Array, "h w *c"]) -> Float[Array, ""]:
-    """Structural similarity of images in [0, 1], mean over pixels and channels (Wang et al. 2004).
+    """Structural similarity of images `a` and `b` in [0, 1], mean over pixels and channels (Wang et al. 2004).
 
     As in 3DGS: Gaussian window 11x11 with σ = 1.5 px, zeros beyond the edge. Reverse mode only.
 
@@ -87,7 +87,7 @@ def _blur_along(images: Float[Array, "*n h w"], axis: int) -> Float[Array, "*n h
     window = np.exp(-(offsets**2) / (2 * _SIGMA**2))
     margins = [(0, 0)] * images.ndim
     margins[axis] = (_RADIUS, _RADIUS)
-    # without the barrier XLA:CPU computes the padded image anew for each of the eleven slices
+    # without the barrier XLA:CPU recomputes the padded image for each of the eleven slices
     padded = lax.optimization_barrier(jnp.pad(images, margins))
     size = images.shape[axis]
     weights = window / window.sum()
@@ -113,6 +113,11 @@ def boundary_iou(prediction: Mask, truth: Mask, dilation_ratio: float = 0.02) ->
 
     A boundary is the mask minus its erosion by a 3x3 element, d times with zeros beyond the edge, where d is
     `dilation_ratio` of the image's diagonal, rounded, and at least 1 px.
+
+    Args:
+        prediction: masks [... h w], as `mean_iou` takes them.
+        truth: masks [... h w].
+        dilation_ratio: width of a boundary as a share of the diagonal; 0.02 is the published value.
     """
     truth = _binary(truth)
     height, width = truth.shape[-2:]
@@ -139,7 +144,7 @@ def _iou(a: Bool[Array, "*v h w"], b: Bool[Array, "*v h w"]) -> Float[Array, "*v
 
 
 def _erode(mask: Bool[Array, "*v h w"], distance: int) -> Bool[Array, "*v h w"]:
-    """Where the square window of this radius is full, counted in a summed-area table: the cost knows no radius."""
+    """Where the square window of this radius is full; a summed-area table makes the cost independent of the radius."""
     size = 2 * distance + 1
     for axis in (mask.ndim - 2, mask.ndim - 1):
         margins = [(0, 0)] * mask.ndim
@@ -169,7 +174,7 @@ def score_masks(
     """mIoU and mBIoU by the protocol of Gaussian Grouping, host.
 
     Args:
-        predictions: masks [h w] by (view, prompt); what is missing scores 0, what has no truth is left out.
+        predictions: masks [h w] by (view, prompt); a missing prediction scores 0, one without truth is left out.
         truths: masks [h w] by (view, prompt).
         dilation_ratio: width of the boundary as a share of the image's diagonal.
 

@@ -49,6 +49,16 @@ class Views(eqx.Module):
         """
         return self[of_split(self.splits, split, "Views")]
 
+    @property
+    def training(self) -> Views:
+        """Views of the split "train"; all views where there is none."""
+        return self.subset("train") if "train" in self.splits else self
+
+    @property
+    def held_out(self) -> Views | None:
+        """Views of the split "test"; None where there is none."""
+        return self.subset("test") if "test" in self.splits else None
+
 
 def of_split(splits: Sequence[str], split: str, where: str) -> list[int]:
     """Numbers of the views of a split.

@@ -1,1 +1,1 @@
-"""Where splats and matter meet: seeding and filling, solids and their colliders, binding and posing."""
+"""Coupling of splats and matter: solids, filling and seeding, colliders from Gaussians, binding and posing."""

@@ -1,19 +1,19 @@
-"""Gaussians that follow the matter: the particles that carry each, and its pose (paper 3.3)."""
+"""Binding: the particles that carry each Gaussian, and the splats posed by them (paper 3.3)."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
-from pigjax.clamp import ClampParams, eigen_clamp
+from pigjax.clamp import ClampParams, clamped_shapes
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import array_field, einsum
+from pigjax.core.arrays import array_field, einsum, in_precision, real_field
 from pigjax.core.errors import InputError
 from pigjax.coupling.seeding import object_ids
 from pigjax.mpm import Particles, Trajectory
@@ -22,12 +22,12 @@ from pigjax.splatting.types import as_splats
 
 
 class Binding(eqx.Module):
-    """Gaussians without a particle of their own, and the particles that carry each."""
+    """Gaussians without a particle of their own, and the k particles that carry each."""
 
-    gaussian: Int[Array, "m"] = array_field()
-    particles: Int[Array, "m k"] = array_field()
-    weights: Float[Array, "m k"] = array_field()  # sum to 1
-    offsets: Float[Array, "m k 3"] = array_field()  # from each particle to the Gaussian, at rest [m]
+    gaussian: Int[Array, "m"] = array_field()  # index of the Gaussian
+    particles: Int[Array, "m k"] = array_field()  # indices of its carriers
+    weights: Float[Array, "m k"] = real_field()  # of the carriers; sum to 1
+    offsets: Float[Array, "m k 3"] = real_field()  # from each particle to the Gaussian, at rest [m]
 
     def __len__(self) -> int:
         return self.gaussian.shape[0]
@@ -35,16 +35,19 @@ class Binding(eqx.Module):
 
 @checked
 def bind(gaussians: Gaussians, labels: Any, particles: Particles, *, neighbours: int = 4) -> Binding:
-    """Carriers for the Gaussians of moving objects that have no particle of their own, host.
+    """Carriers for the Gaussians of moving objects that have no particle of their own. Host.
 
-    These are floaters, and what `gaussians_per_cell` left out; its length says how many. Each goes with the nearest
-    particles of its object that carry a Gaussian, weighed by inverse square distance.
+    These are floaters, and the Gaussians that `gaussians_per_cell` left out; the length of the result is their number.
+    Each is carried by the nearest particles of its object that have a Gaussian, weighted by inverse square distance.
 
     Args:
         gaussians: the scene.
         labels: `Labels`, or the object id of each Gaussian [n].
-        particles: as `seed_particles` gave them, at rest.
-        neighbours: carriers of each Gaussian.
+        particles: of `seed_particles`, at rest.
+        neighbours: number of carriers of each Gaussian; four span an affine motion.
+
+    Raises:
+        InputError: the labels are not one for each Gaussian.
     """
     object_id = object_ids(gaussians, labels)
     means, x, carried = np.asarray(gaussians.means), np.asarray(particles.x), np.asarray(particles.gaussian)
@@ -59,7 +62,7 @@ def bind(gaussians: Gaussians, labels: Any, particles: Particles, *, neighbours:
         nearest[mine] = carriers[np.minimum(index, len(carriers) - 1)]
     offsets = means[loose][:, None] - x[nearest]
     squared = np.sum(np.asarray(offsets, np.float64) ** 2, -1)
-    # a Gaussian at the very place of a particle goes with that one, whatever the scale of the scene
+    # a Gaussian at the position of a particle is carried by that one alone, at any scale of the scene
     weights = 1 / np.maximum(squared, 1e-12 * squared.max(initial=1e-200))
     weights = (weights / weights.sum(1, keepdims=True)).astype(x.dtype)
     return Binding(jnp.asarray(loose), jnp.asarray(nearest), jnp.asarray(weights), jnp.asarray(offsets))
@@ -74,17 +77,21 @@ def deform(
     mode: str = "aligned",
     binding: Binding | None = None,
 ) -> Splats:
-    """The scene with its moving Gaussians where the particles are, shaped by their deformation (paper 3.3).
+    """The scene posed by its particles: Gaussians moved and shaped by the deformation of the matter (paper 3.3).
 
-    A Gaussian with a particle takes its position and `F_visual`. One that is bound sits at Σ wᵢ (xᵢ + Fᵢ rᵢ), which is
-    exact for affine motion. All others are drawn as they stand.
+    A Gaussian with a particle takes its position and `F_visual`. A bound one is at Σ wᵢ (xᵢ + Fᵢ rᵢ), which is exact
+    for affine motion. Only means, factors and rotations of the colour of these two kinds are written; all else is the
+    rest pose.
 
     Args:
         gaussians: the scene at rest.
-        particles: moved ones, see `at_frame`.
+        particles: as simulated, see `at_frame`.
         params: bounds of the eigen-clamp.
         mode: of `eigen_clamp`.
         binding: carriers of the Gaussians without a particle; without it they stay at rest.
+
+    Raises:
+        InputError: unknown mode.
     """
     # no Gaussian has two particles, so the moving ones are at most as many as either
     (row,) = jnp.nonzero(particles.gaussian >= 0, size=min(len(gaussians), len(particles)), fill_value=len(particles))
@@ -98,21 +105,31 @@ def deform(
         x = jnp.concatenate([x, einsum("mk,mki->mi", binding.weights, reached)])
         F = jnp.concatenate([F, einsum("mk,mkij->mij", binding.weights, carriers)])
 
-    moving = jax.tree.map(lambda values: values.at[index].get(mode="clip"), gaussians)
-    posed = eigen_clamp(eqx.tree_at(lambda g: g.means, moving, x), F, params, mode=mode)
+    quats, log_scales = (values.at[index].get(mode="clip") for values in (gaussians.quats, gaussians.log_scales))
+    F, params = in_precision((F, params), x.dtype)
+    coloured = gaussians.sh.shape[1] > 1
+    factors, turned = clamped_shapes(quats, log_scales, F, params, mode=mode, coloured=coloured)
     rest = as_splats(gaussians)
-    if posed.sh_rotations is not None:
-        still = jnp.broadcast_to(jnp.eye(3, dtype=F.dtype), (len(gaussians), 3, 3))
-        rest = eqx.tree_at(lambda s: s.sh_rotations, rest, still, is_leaf=lambda leaf: leaf is None)
-    return jax.tree.map(lambda all_, moved: all_.at[index].set(moved, mode="drop"), rest, posed)
+    at_rest = jnp.broadcast_to(jnp.eye(3, dtype=F.dtype), (len(gaussians), 3, 3))
+    return dataclasses.replace(
+        rest,
+        means=rest.means.at[index].set(x, mode="drop"),
+        factors=rest.factors.at[index].set(factors, mode="drop"),
+        sh_rotations=None if turned is None else at_rest.at[index].set(turned, mode="drop"),
+    )
 
 
 @checked
 def at_frame(particles: Particles, trajectory: Trajectory, frame: int | Int[Array, ""]) -> Particles:
-    """Particles as they are drawn after a frame; the elastic F and C stay as in `particles`.
+    """Particles with positions, velocities and `F_visual` of a frame, to be drawn; the elastic F and C do not change.
+
+    Args:
+        particles: of the simulation.
+        trajectory: of `rollout`.
+        frame: number of the frame, from 0; negative numbers count from the end.
 
     Raises:
-        InputError: the trajectory has no such frame (where it is known; JAX would take the last one).
+        InputError: the trajectory has no such frame (a traced frame is not checked; JAX would take the last one).
     """
     frames = trajectory.x.shape[0]
     if isinstance(frame, int | np.integer) and not -frames <= frame < frames:

@@ -1,4 +1,4 @@
-"""Interior filling: particles on a jittered lattice inside a shell of Gaussians, host (NumPy and SciPy)."""
+"""Interior filling: particles on a jittered lattice inside a shell of Gaussians (NumPy and SciPy, host)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pigjax.coupling.solid import Solid, shell_of, solid_of
 from pigjax.splat import Gaussians
 
 _LEAST_SHARE = 1e-3  # of a lattice cell; less is rounding
-_BOX = 50  # lattice cells in the bounding box per particle that is allowed
+_BOX = 50  # most lattice cells in the bounding box, per particle of `max_particles`
 
 
 class FilledPoints(NamedTuple):
@@ -32,14 +32,14 @@ def fill_interior(
     seed: int = 0,
     max_cells: int = 64,
 ) -> FilledPoints:
-    """Points on a jittered lattice inside the shell that Gaussians make, host.
+    """Points on a jittered lattice inside the shell of an object's Gaussians. Host.
 
     Args:
         gaussians: of one object; its shell may be open where no camera saw it.
-        spacing: edge of the cell that `particles_per_cell` counts in, usually the simulation's dx [m].
-        particles_per_cell: points in a full cell.
+        spacing: edge of the cell that `particles_per_cell` refers to, usually the simulation's dx [m].
+        particles_per_cell: points in a full cell; 8 is two along each axis.
         seed: of the jitter.
-        max_cells: finest resolution of the inside test along the object's longest side; bounds time and memory.
+        max_cells: voxels of the inside test along the object's longest side; bounds time and memory.
 
     Raises:
         InputError: no Gaussians, non-finite means, spacing ≤ 0, or too coarse or fine to fill the object.
@@ -49,7 +49,11 @@ def fill_interior(
 
 
 def lattice_step(spacing: float | int, particles_per_cell: float | int) -> float:
-    """Distance between lattice points [m] that puts so many of them in each cell.
+    """Distance between lattice points [m] at which a cell holds `particles_per_cell` of them.
+
+    Args:
+        spacing: edge of the cell [m].
+        particles_per_cell: points in a full cell.
 
     Raises:
         InputError: either number is not positive.
@@ -67,7 +71,16 @@ def fill_solid(
     max_particles: int = 4_000_000,
     name: str = "gaussians",
 ) -> FilledPoints:
-    """One point in each lattice cell whose centre is inside; volumes are the cells' occupancies, scaled to the whole.
+    """One point in each lattice cell whose centre is inside; volumes are those of the solid in the cells.
+
+    Volumes are scaled so that they sum to the volume of the solid.
+
+    Args:
+        solid: of `solid_of`.
+        step: edge of a lattice cell [m].
+        seed: of the jitter.
+        max_particles: most lattice cells; bounds memory.
+        name: of the solid, for messages.
 
     Raises:
         InputError: the lattice would have no or more than `max_particles` points in the solid `name`.
@@ -87,6 +100,12 @@ def lattice_cells(
 ) -> tuple[Float[np.ndarray, "c 3"], Float[np.ndarray, "c"]]:
     """Centres [m] of the lattice cells that touch the solid, and the volume of the solid in each [m³].
 
+    Args:
+        solid: of `solid_of`.
+        step: edge of a lattice cell [m].
+        max_particles: most cells; bounds memory.
+        name: of the solid, for messages.
+
     Raises:
         InputError: there would be more than `max_particles` cells.
     """
@@ -104,7 +123,7 @@ def lattice_cells(
     reach = 3 + 2 * int(np.ceil(step / solid.voxel))
     touched = ndimage.maximum_filter(solid.occupancy, reach) > 0
     slabs = []
-    # one slab at a time keeps memory small for a lattice that is mostly empty
+    # one slab at a time bounds the memory for a lattice that is mostly empty
     for i in range(counts[0]):
         corners = np.stack(np.meshgrid(i, np.arange(counts[1]), np.arange(counts[2]), indexing="ij"), -1).reshape(-1, 3)
         voxels = np.floor((solid.low + (corners + 0.5) * step - solid.origin) / solid.voxel).astype(int)
@@ -120,6 +139,9 @@ def lattice_cells(
 def jittered(
     points: Float[np.ndarray, "p 3"], solid: Solid, step: float, seed: int, amount: float = 0.25
 ) -> Float[np.ndarray, "p 3"]:
-    """Lattice points moved by up to `amount` steps, never out of the solid: a regular lattice shows in fracture."""
+    """Lattice points [m] displaced by up to `amount` steps, never out of the solid.
+
+    Fracture would show a regular lattice.
+    """
     moved = points + np.random.default_rng(seed).uniform(-amount, amount, points.shape) * step
     return np.where(solid.inside(moved)[:, None], moved, points)

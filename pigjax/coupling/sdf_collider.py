@@ -1,4 +1,4 @@
-"""Still objects as colliders: the signed distance from the surface that their Gaussians make."""
+"""Colliders from still objects: the signed distance from the surface of their Gaussians."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from pigjax.coupling.solid import shell_of, surface_of
 from pigjax.mpm.colliders import SampledDistance
 from pigjax.splat import Gaussians
 
-_NEIGHBOURS = 64  # samples of the surface that shape the distance at a point
+_NEIGHBOURS = 64  # surface samples that the distance at a point depends on
 _SMOOTHING = 3  # width of their weights, in distances between samples; trained splats lie unevenly
-_MARGIN = 3  # samples of the distance around the object
-_DEPTH = 16  # samples below it: an open surface carries that deep
+_MARGIN = 3  # grid samples around the object
+_DEPTH = 16  # grid samples below it: an open surface is solid that deep
 
 
 @checked
@@ -32,17 +32,17 @@ def collider_from_gaussians(
     mode: str = "separate",
     name: str = "object",
 ) -> SampledDistance:
-    """Collider from the surface of still Gaussians, host.
+    """Collider from the surface of still Gaussians. Host.
 
-    The surface may be open: what lies behind it is inside, however deep, so a floor or a table seen from above
-    carries. Where something stands on it and hid it from the cameras, the surface goes on as flat as its rim.
+    The surface may be open: all points behind it are inside, however deep, so a floor or a table seen from above bears
+    loads. Where another object hid it from the cameras, the surface is continued as flat as its rim.
 
     Args:
         gaussians: of the object.
         spacing: between samples of the distance, the simulation's dx or finer [m].
         up: axis of the world that points up; no surface faces down.
         others: centres of the Gaussians of other objects, which hid parts of the surface [m].
-        friction: Coulomb's coefficient.
+        friction: Coulomb's coefficient; 0.5 is that of many dry solids.
         mode: of `Collider`.
         name: of the object, for messages.
 
@@ -67,10 +67,17 @@ def collider_from_gaussians(
 def signed_distance(
     at: Float[np.ndarray, "p 3"], points: Float[np.ndarray, "s 3"], normals: Float[np.ndarray, "s 3"], width: float
 ) -> Float[np.ndarray, "p"]:
-    """Distance from an oriented point cloud, negative behind it: moving averages (Alexa & Adamson 2004).
+    """Signed distance from an oriented point cloud [m], negative behind it: moving averages (Alexa & Adamson 2004).
 
-    Measured from the plane through the mean of the nearest points across their mean normal, both weighed by a Gaussian
-    of `width` [m], which grows with the distance so that a far place does not follow the noise of a few normals.
+    It is the distance from the plane through the weighted mean of the nearest points, normal to their mean normal. The
+    weights are Gaussian; their width grows with the distance, so that far from the surface the result does not follow
+    the noise of a few normals.
+
+    Args:
+        at: where the distance is wanted [m].
+        points: surface samples [m].
+        normals: their unit normals, outward.
+        width: least width of the weights [m].
     """
     gap, nearest = cKDTree(points).query(at, k=min(_NEIGHBOURS, len(points)), workers=-1)
     gap, nearest = gap.reshape(len(at), -1), nearest.reshape(len(at), -1)
@@ -80,6 +87,6 @@ def signed_distance(
     centre = np.einsum("pk,pkj->pj", weights, points[nearest])
     normal = np.einsum("pk,pkj->pj", weights, normals[nearest])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
-    # between two sides the normals cancel: then the nearest one decides
+    # between two sides the normals cancel: there the normal of the nearest point is used
     normal = np.where(length > 0.1, normal / np.maximum(length, 0.1), normals[nearest[:, 0]])
     return np.sum((at - centre) * normal, 1)

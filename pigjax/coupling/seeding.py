@@ -1,4 +1,4 @@
-"""Matter from Gaussians: particles for the objects that have a material."""
+"""Seeding: particles for the objects that have a material."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pigjax.mpm.materials import Material, MaterialTable, material_table
 from pigjax.splat import Gaussians
 
 _DEFAULT_COUNT = 40_000  # lattice particles of all objects together where no spacing is given
-_LEAST_SHARE = 0.05  # of a lattice cell that any Gaussian in it weighs: lighter particles are flung about by heavy ones
+_LEAST_SHARE = 0.05  # of a lattice cell that each Gaussian in it weighs: heavy particles fling lighter ones about
 _GRAIN = 4 / 3 * np.pi * 1.5**3  # volume of the ellipsoid of 1.5 standard deviations
 
 
@@ -40,34 +40,35 @@ def seed_particles(
     max_cells: int = 64,
     max_particles: int = 4_000_000,
 ) -> tuple[Particles, MaterialTable]:
-    """Matter for the objects that have a material, host.
+    """Particles for the objects that have a material. Host.
 
-    Every Gaussian of such an object becomes a particle at its centre, unless it floats apart from the object. The
-    object's inside is filled by a jittered lattice, one particle in each lattice cell that holds no Gaussian. Volume
-    is the solid's volume in each cell, shared by the Gaussians in it, at least 5 % of a cell, and scaled so that each
-    object has the solid's volume. Where one object lies in another, the larger one makes room.
+    Every Gaussian of such an object becomes a particle at its centre, unless it is a floater. The inside is filled by
+    a jittered lattice, one particle in each lattice cell that holds no Gaussian. The volume of the solid in a cell
+    is shared by the Gaussians in it, each at least 5 % of a cell, and scaled so that the object has the volume of its
+    solid. Where one object lies in another, the larger one is not filled there.
 
     Args:
         gaussians: the scene.
         labels: `Labels`, or the object id of each Gaussian [n].
-        materials: material by object id; its rows in the table follow this order.
-        fill: whether the inside is filled; otherwise matter is only where Gaussians are.
-        spacing: edge of the cell that `particles_per_cell` counts in, usually the simulation's dx [m]. By default all
+        materials: material by object id; the rows of the table have this order.
+        fill: whether the inside is filled; otherwise only Gaussians become particles.
+        spacing: edge of the cell that `particles_per_cell` refers to, usually the simulation's dx [m]. By default all
             objects together get about 40,000 lattice cells.
         velocities: initial velocity [m/s] by object id, zero for the others.
-        particles_per_cell: lattice particles in a full cell.
-        gaussians_per_cell: most Gaussians that become particles in one lattice cell; `bind` carries the others.
-        colliders: where they are, objects are not filled.
+        particles_per_cell: lattice particles in a full cell; 8 is two along each axis, as usual in MPM.
+        gaussians_per_cell: most Gaussians that become particles in one lattice cell; `bind` finds carriers for the
+            others. None: no limit.
+        colliders: the space inside of them is not filled.
         seed: of the jitter.
         max_cells: finest resolution of the inside test, see `fill_interior`.
-        max_particles: lattice cells that one object may have.
+        max_particles: most lattice cells of one object; bounds memory.
 
     Returns:
         Particles, and the table of their materials.
 
     Raises:
         InputError: no materials; an id that is 0, negative or has no Gaussians; a velocity for an id without material;
-            labels of another length; two objects at one place; or a spacing that gives no or too many particles.
+            labels of another length; two objects in the same place; or a spacing that gives no or too many particles.
     """
     object_id = object_ids(gaussians, labels)
     velocities = dict(velocities or {})
@@ -113,7 +114,11 @@ class _Matter(NamedTuple):
 
 
 def object_ids(gaussians: Gaussians, labels: Any) -> Int[np.ndarray, "n"]:
-    """Object of each Gaussian, from `Labels` or an array of ids (InputError where their number is another)."""
+    """Object of each Gaussian, from `Labels` or an array of ids.
+
+    Raises:
+        InputError: there is not one id for each Gaussian.
+    """
     object_id = np.asarray(getattr(labels, "object_id", labels))
     if object_id.shape != (len(gaussians),):
         raise InputError(f"labels has shape {object_id.shape}: {len(gaussians)} Gaussians need one object id each.")
@@ -170,7 +175,7 @@ def _matter_of(
     cell_of_point, cell_of_own = np.split(cell, [len(points)])
     count = cell.max() + 1
     grains = _GRAIN * np.prod(np.linalg.norm(shell.axes[own], axis=1), 1)
-    # sheets and single Gaussians have no inside: they weigh what their ellipsoids hold
+    # sheets and single Gaussians have no inside: their volume is that of their ellipsoids
     volume = np.minimum(np.bincount(cell_of_own, grains, count), step**3)
     volume[cell_of_point] = contents
 
@@ -189,7 +194,7 @@ def _matter_of(
 
 
 def _taken(points: np.ndarray, item: _Object, objects: list[_Object]) -> np.ndarray:
-    """Which lattice points lie in a smaller object.
+    """Lattice points that lie in a smaller object.
 
     Raises:
         InputError: another object fills the same place.

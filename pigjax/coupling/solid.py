@@ -1,4 +1,4 @@
-"""From the shell of Gaussians that cameras saw to the solid behind it, host (NumPy and SciPy)."""
+"""Solids from shells of Gaussians: the inside test by winding numbers (NumPy and SciPy, host)."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from pigjax.splat import Gaussians
 
 _MARGIN = 4  # empty voxels around the shell
 _SMOOTHING = 0.7  # of the winding number [voxels]; less shows single samples, more rounds corners
-_NEIGHBOURS = 24  # about two voxels' reach on a surface
-_LEAST_OPACITY = 0.05  # fainter Gaussians are no surface
+_NEIGHBOURS = 24  # surface samples within about two voxels
+_LEAST_OPACITY = 0.05  # fainter Gaussians are not part of the surface
 _LEAST_SKY = 2.0  # a sample that sees less of the outside, or sees it on both sides, has no known outer side
 _LEAST_DISCS = 8
-_LEAST_JUMP = 0.3  # of the winding number across the surface; below it the shell is no shell
+_LEAST_JUMP = 0.3  # least jump of the winding number across the surface of a shell
 _FULL = 0.25  # share of inner voxels with Gaussians in them above which a cloud is filled, not a shell
-_MOST_SWELLING = 2.0  # a filled cloud's density spans little more than its winding number; strays in a shell, far more
+_MOST_SWELLING = 2.0  # volume of a filled cloud's density over that of its winding number; strays in a shell exceed it
 _MOST_SAMPLES = 4_000_000
 _DIRECTIONS = np.array([d for d in product((-1, 0, 1), repeat=3) if any(d)])
 
 
 class Solid(NamedTuple):
-    """The inside of a shell, as winding numbers on a grid: 1 inside, 0 outside, 0.5 on the surface."""
+    """The inside of a shell as generalised winding numbers on a grid: 1 inside, 0 outside, 0.5 on the surface."""
 
     winding: Float[np.ndarray, "x y z"]  # at voxel centres
     occupancy: Float[np.ndarray, "x y z"]  # share of each voxel that is inside
@@ -45,17 +45,17 @@ class Solid(NamedTuple):
         return float(self.occupancy.sum(dtype=np.float64)) * self.voxel**3
 
     def inside(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        """Which points are in the solid."""
+        """Whether each point [m] is in the solid."""
         in_box = np.all((points >= self.low) & (points <= self.high), 1)
         return in_box & (_interpolate(self.winding, points, self.origin, self.voxel) > 0.5)
 
     def share(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """Share of a voxel around each point that is inside."""
+        """Share of a voxel around each point [m] that is inside."""
         return _interpolate(self.occupancy, points, self.origin, self.voxel)
 
 
 class Shell(NamedTuple):
-    """What a solid is made from: Gaussians as NumPy arrays, and which of them hang together."""
+    """Gaussians of one object as NumPy arrays, and which of them are connected."""
 
     means: Float[np.ndarray, "n 3"]  # [m]
     axes: Float[np.ndarray, "n 3 3"]  # columns: principal axes, longest first, as long as one standard deviation [m]
@@ -65,7 +65,11 @@ class Shell(NamedTuple):
 
 
 def shell_of(gaussians: Gaussians, *, name: str = "gaussians") -> Shell:
-    """Principal axes, and which Gaussians belong together: clusters below 1 % of the whole are floaters.
+    """Principal axes of Gaussians, and which are connected: clusters below 1 % of the object are floaters.
+
+    Args:
+        gaussians: of one object.
+        name: of the object, for messages.
 
     Raises:
         InputError: no Gaussians, or means that are not finite.
@@ -92,7 +96,7 @@ def _connected(means: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"]) -
     if count == 1:
         return np.ones(1, bool), float(radii[0])
     distances, neighbours = cKDTree(means).query(means, k=min(7, count))
-    # where most centres coincide, the splats themselves say how large a gap is
+    # where most centres coincide, the radii of the splats are the scale
     typical = float(np.median(distances[:, -1])) or float(np.median(radii))
     reach = np.minimum(radii, 4 * typical)
     linked = distances <= np.maximum(4 * typical, 2 * (reach[:, None] + reach[neighbours]))
@@ -107,14 +111,18 @@ def _connected(means: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"]) -
 
 
 def solid_of(shell: Shell, *, max_cells: int = 64) -> Solid:
-    """The solid within a shell: where the shell's generalised winding number exceeds one half.
+    """The solid within a shell: the region where the shell's generalised winding number exceeds one half.
 
     Each sample of the shell is a small oriented disc; the winding number of all discs solves a Poisson equation
     (Jacobson et al. 2013; Kazhdan et al. 2006), here by FFT. Where the shell is open, as under an object that stands
     on a table, the level of one half closes a flat hole by a flat lid. The outer side of a disc is the one that sees
-    more sky along 26 directions. Level and positions are calibrated so that the surface passes through the Gaussians'
-    centres. A cloud that is itself filled with Gaussians is bounded by their density instead. What is sheet-like or
-    seen from both sides has no inside.
+    more sky along 26 directions. Level and positions are calibrated so that the surface passes through the centres of
+    the Gaussians. A cloud that is filled with Gaussians is bounded by their density instead. Sheets, and shells seen
+    from both sides, have no inside: the volume is 0.
+
+    Args:
+        shell: of `shell_of`.
+        max_cells: voxels along the longest side; 64 resolves 1.6 % of it.
     """
     means = shell.means[_surface_members(shell)]
     low, high = means.min(0), means.max(0)
@@ -139,7 +147,7 @@ def solid_of(shell: Shell, *, max_cells: int = 64) -> Solid:
 
 
 def _density_level(occupied: Bool[np.ndarray, "x y z"], voxels: int) -> Float[np.ndarray, "x y z"]:
-    """For a cloud that is filled with Gaussians: their density, scaled so that it exceeds one half in `voxels`."""
+    """Density of a cloud filled with Gaussians, scaled so that it exceeds one half in `voxels` voxels."""
     density = ndimage.gaussian_filter(occupied.astype(np.float32), 1.5)
     place = density.size - 1 - min(voxels, density.size - 1)
     return density / (2 * np.partition(density.ravel(), place)[place])
@@ -163,10 +171,18 @@ class _Discs(NamedTuple):
 def surface_of(
     shell: Shell, spacing: float, up: Float[np.ndarray, "3"], blockers: Float[np.ndarray, "b 3"] | None = None
 ) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
-    """Points on a surface that was seen from above, about `spacing` [m] apart, and unit normals out of it, if any.
+    """Points [m] on a surface that was seen from above, and their outward unit normals.
 
-    The surface may be open below, as a table or a floor is: no normal points to where no camera was. What lies behind
-    `blockers`, points of other objects [m], was not seen either and is left out.
+    The surface may be open below, as a table or a floor is: no normal points away from all cameras.
+
+    Args:
+        shell: of `shell_of`.
+        spacing: distance between the points [m].
+        up: unit vector.
+        blockers: points of other objects [m], which hid parts of the surface; no points are placed there.
+
+    Returns:
+        Points and normals, both empty if there is no surface with an outer side.
     """
     discs, _, _ = _discs_of(shell, max(shell.spacing, spacing), _DIRECTIONS[_DIRECTIONS @ up > -0.1], blockers)
     if discs is None:
@@ -186,7 +202,7 @@ def _discs_of(
     directions: Int[np.ndarray, "d 3"] = _DIRECTIONS,
     blockers: Float[np.ndarray, "b 3"] | None = None,
 ) -> tuple[_Discs | None, Bool[np.ndarray, "x y z"], Float[np.ndarray, "3"]]:
-    """Oriented discs on the shell, or None without enough of them; the voxels that it occupies and their corner."""
+    """Oriented discs on the shell, None if they are too few; the voxels that it occupies, and their corner [m]."""
     kept = _surface_members(shell)
     means = shell.means[kept]
     origin = means.min(0) - _MARGIN * voxel
@@ -210,14 +226,14 @@ def _discs_of(
 
 
 def _disc_samples(shell: Shell, kept: Bool[np.ndarray, "n"], voxel: float) -> Float[np.ndarray, "s 3"]:
-    """Points over each Gaussian's disc of one standard deviation, about one a voxel; a round one gives its centre.
+    """Points on each Gaussian's disc of one standard deviation, about one per voxel; a round one gives its centre.
 
-    A Gaussian wider than a quarter of the object describes no surface of it: its disc is held to that.
+    Discs are clamped to a quarter of the object, since wider Gaussians do not describe its surface.
     """
     means, axes = shell.means[kept], shell.axes[kept]
     widest = np.ptp(means, axis=0).max() / 8
     lengths = np.linalg.norm(axes, axis=1)
-    # what a Gaussian extends along its shortest axis too is blur, not surface
+    # the extent along the shortest axis is blur; it is subtracted from the other two
     extent = np.minimum(np.sqrt(np.maximum(lengths[:, :2] ** 2 - lengths[:, 2:] ** 2, 0)), widest)
     directions = axes[:, :, :2] / lengths[:, None, :2]
     counts = 1 + np.ceil(np.pi * np.maximum(extent[:, 0], voxel) * np.maximum(extent[:, 1], voxel) / voxel**2)
@@ -243,7 +259,7 @@ def _sky(
 
 
 def _blocked(occupied: Bool[np.ndarray, "x y z"], direction: Int[np.ndarray, "3"]) -> Bool[np.ndarray, "x y z"]:
-    """Whether some occupied voxel lies ahead of each voxel: a sweep of slices against the direction."""
+    """Whether an occupied voxel lies ahead of each voxel: a sweep of slices against the direction."""
     axis = int(np.flatnonzero(direction)[0])
     forward = int(direction[axis])
     slices = np.moveaxis(occupied, axis, 0)
@@ -258,7 +274,7 @@ def _blocked(occupied: Bool[np.ndarray, "x y z"], direction: Int[np.ndarray, "3"
 
 
 def _oriented_discs(points: Float[np.ndarray, "s 3"], sky: Float[np.ndarray, "s 3"], voxel: float) -> _Discs:
-    """Normals from the plane of the nearest samples, outward as the neighbours' sky says; areas from their density."""
+    """Normals from the plane of the nearest samples, outward by the neighbours' sky; areas from their density."""
     reach, neighbours = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))
     weights = np.exp(-(reach**2) / (2 * voxel**2))
     few, few_weights = neighbours[:, :8], weights[:, :8] / weights[:, :8].sum(1, keepdims=True)
@@ -268,7 +284,7 @@ def _oriented_discs(points: Float[np.ndarray, "s 3"], sky: Float[np.ndarray, "s 
     normals = np.linalg.eigh(np.einsum("ski,skj->sij", patch, patch))[1][:, :, 0]
     normals *= np.where(np.sum(normals * sky, 1) < 0, -1, 1)[:, None]
     clear = np.linalg.norm(sky, axis=1) >= _LEAST_SKY
-    # the back of a thin wall is as near as the front's own neighbours, and has its own area
+    # samples on the back of a thin wall are as near as those on the front, but not part of its density
     same_side = (np.einsum("skj,sj->sk", normals[neighbours], normals) > 0) & clear[neighbours]
     density = np.sum(weights * same_side, 1) / (2 * np.pi * voxel**2)
     areas = np.where(clear, 1 / np.where(clear, density, 1.0), 0.0)
@@ -291,7 +307,7 @@ class _Poisson:
     def winding(
         self, points: Float[np.ndarray, "s 3"], normals: Float[np.ndarray, "s 3"], areas: Float[np.ndarray, "s"]
     ) -> Float[np.ndarray, "x y z"]:
-        """Each disc is a dipole: two charges, half a voxel within and beyond it."""
+        """Winding number of discs [m], each a dipole: two charges, half a voxel inside and outside of it."""
         charges = np.concatenate([areas, -areas]) / self.voxel**4
         offset = 0.5 * self.voxel * normals
         place = (np.concatenate([points - offset, points + offset]) - self.origin) / self.voxel - 0.5
@@ -303,16 +319,16 @@ class _Poisson:
             field += np.bincount(np.ravel_multi_index((base + corner).T, self.shape), charges * weights, len(field))
         spectrum = fft.rfftn(field.reshape(self.shape).astype(np.float32), s=self.padded, workers=-1)
         winding = fft.irfftn(spectrum * self.green, s=self.padded, workers=-1)
-        # the solution is known up to a constant: it is 0 far away, in the middle of the padding
+        # the solution is known up to a constant, which makes it 0 far away, in the middle of the padding
         middle = [(size + padded) // 2 for size, padded in zip(self.shape, self.padded)]
         far = np.mean([winding.take(m, axis).mean() for axis, m in enumerate(middle)])
         return winding[tuple(slice(size) for size in self.shape)] - far
 
 
 def _level_shift(winding: Float[np.ndarray, "x y z"], discs: _Discs, grid: _Poisson) -> Float[np.ndarray, "s"]:
-    """How far [m] each disc must move along its normal for the level of one half to pass through its sample.
+    """Displacement [m] of each disc along its normal that makes the level of one half pass through its sample.
 
-    Smoothing draws the level towards the centre of curvature; it should lie midway between both sides' values.
+    Smoothing moves the level towards the centre of curvature; it should lie midway between the values on both sides.
     """
     inner, outer = _both_sides(winding, discs, grid, 2.5)
     near_inner, near_outer = _both_sides(winding, discs, grid, 0.5)
@@ -323,13 +339,13 @@ def _level_shift(winding: Float[np.ndarray, "x y z"], discs: _Discs, grid: _Pois
 
 
 def _jump(winding: Float[np.ndarray, "x y z"], discs: _Discs, grid: _Poisson) -> float:
-    """Typical step of the winding number across the surface; 1 if areas and normals were exact."""
+    """Typical jump of the winding number across the surface; 1 for exact areas and normals."""
     inner, outer = _both_sides(winding, discs, grid, 2.5)
     return max(float(np.median((inner - outer)[discs.areas > 0])), _LEAST_JUMP)
 
 
 def _both_sides(winding: Float[np.ndarray, "x y z"], discs: _Discs, grid: _Poisson, voxels: float):
-    """Winding number so many voxels within and beyond each disc."""
+    """Winding number at a distance of `voxels` inside and outside of each disc."""
     offset = voxels * grid.voxel * discs.normals
     return tuple(_interpolate(winding, discs.points + sign * offset, grid.origin, grid.voxel) for sign in (-1, 1))
 
@@ -341,7 +357,7 @@ def _occupancy(
     low: Float[np.ndarray, "3"],
     high: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "x y z"]:
-    """Share of each voxel within the level of one half and within the box, by the level's distance from its centre."""
+    """Share of each voxel inside the level of one half and the box, from the distance of the level to its centre."""
     slope = np.sqrt(sum(derivative**2 for derivative in np.gradient(winding)))
     occupancy = np.clip(0.5 + (winding - 0.5) / np.maximum(slope, 1e-2), 0, 1)
     for axis, size in enumerate(winding.shape):

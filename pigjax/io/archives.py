@@ -1,4 +1,4 @@
-"""Arrays, tables and figures on disk: `.npy`, `.npz`, `.csv`, `.parquet`, and what matplotlib draws."""
+"""Arrays, tables and figures on disk: `.npy`, `.npz`, `.csv`, `.parquet`, and figures of matplotlib."""
 
 from __future__ import annotations
 
@@ -68,8 +68,8 @@ def load_arrays(
     Args:
         path: of the file.
         what: the kind of file, for messages: "table".
-        remedy: what the reader of a message can do.
-        check: told {name: ArrayHeader} before any array is read; what it raises comes through.
+        remedy: advice to the reader of a message.
+        check: told {name: ArrayHeader} before any array is read; its exceptions are passed on.
         prefixes: arrays whose names begin with none of these are not read.
 
     Raises:
@@ -79,6 +79,8 @@ def load_arrays(
     path = existing(path, what)
     with decoding(path, what, remedy=remedy), zipfile.ZipFile(path) as archive:
         headers = {info.filename.removesuffix(".npy"): _header(archive, info) for info in archive.infolist()}
+        if len(headers) < len(archive.infolist()):
+            raise ValueError("two of its arrays have one name")
         if check is not None:
             check(headers)
         arrays = {}
@@ -91,19 +93,28 @@ def load_arrays(
         return arrays
 
 
-def load_array(path: PathLike, what: str, *, remedy: str = "save it again") -> np.ndarray:
+def load_array(
+    path: PathLike,
+    what: str,
+    *,
+    remedy: str = "save it again",
+    check: Callable[[ArrayHeader], None] = lambda header: None,
+) -> np.ndarray:
     """The array of a `.npy`; no memory is asked for that the file does not fill.
+
+    Args:
+        path: of the file.
+        what: the kind of file, for messages.
+        remedy: what the reader of a message can do.
+        check: told shape and type before the array is read; what it raises comes through.
 
     Raises:
         MissingFileError: there is no such file.
-        InputError: the file is damaged, or holds Python objects.
+        InputError: the file is damaged, holds Python objects, or `check` refuses it.
     """
     path = existing(path, what)
     with decoding(path, what, remedy=remedy), path.open("rb") as file:
-        header = _read_header(file)
-        left = path.stat().st_size - file.tell()
-        if _bytes_of(header) > left:
-            raise ValueError(f"its header tells of {_bytes_of(header)} bytes, and {left} follow")
+        check(read_header(file, path.stat().st_size))
         file.seek(0)
         return np.lib.format.read_array(file, allow_pickle=False)
 
@@ -165,27 +176,32 @@ def plain_label(text: str) -> str:
 
 def _header(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> ArrayHeader:
     with archive.open(info) as file:
-        header = _read_header(file)
-        if _bytes_of(header) > info.file_size - file.tell():
-            raise ValueError(f"{info.filename} tells of {_bytes_of(header)} bytes and holds {info.file_size}")
-    return header
+        return read_header(file, info.file_size)
 
 
-def _read_header(file: Any) -> ArrayHeader:
-    version = np.lib.format.read_magic(file)
-    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
-    if read is None:
-        raise ValueError(f"version {version} of .npy")
-    shape, _, dtype = read(file)
+def read_header(file: Any, size: int) -> ArrayHeader:
+    """Shape and type of the array in NumPy's format that begins here in a file of a size [bytes], which is read on.
+
+    Raises:
+        ValueError: there is none, it holds Python objects, or the file has no room for it.
+    """
+    try:
+        version = np.lib.format.read_magic(file)
+        shape, _, dtype = _HEADERS[version](file)
+    except OSError:
+        raise
+    except Exception as error:  # NumPy reads it as Python code, and answers in the words of a tokenizer
+        raise ValueError("the header of an array is damaged") from error
     if dtype.hasobject:
         raise ValueError("it holds Python objects")
     if any(extent < 0 for extent in shape):
         raise ValueError(f"shape {shape}")
+    if (wanted := math.prod(shape) * dtype.itemsize) > (left := size - file.tell()):
+        raise ValueError(f"the header of an array tells of {wanted} bytes, and {left} follow")
     return ArrayHeader(shape, dtype)
 
 
-def _bytes_of(header: ArrayHeader) -> int:
-    return math.prod(header.shape) * header.dtype.itemsize
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def _no_formula(value: Any) -> Any:

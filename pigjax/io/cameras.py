@@ -104,7 +104,7 @@ def load_views(
         options: dict[str, Any] = {"merge": merge, "missing": missing_masks, "holes": holes}
         ids = load_masks(folder, names, sizes[0], frames=frame_order(all_names), **options)
     return Views(
-        cameras=_cameras(shots, sizes),
+        cameras=_cameras(shots, sizes, origin),
         names=names,
         images=np.stack(pictures),
         masks=ids,
@@ -126,7 +126,7 @@ def load_cameras(
     shots = _read_capture(path, None, origin).shots
     sizes = [_target_size(shot, max_size) for shot in shots]
     _check_one_size(shots, sizes)
-    return _cameras(shots, sizes), name_views(shots)
+    return _cameras(shots, sizes, origin), name_views(shots)
 
 
 def _read_capture(path: PathLike, images: PathLike | None, origin: Origin | None) -> Capture:
@@ -218,8 +218,8 @@ def _picture(shot: Shot, size: tuple[int, int], background: Background) -> Float
     return np.asarray(picture, np.float32) / 255
 
 
-def _cameras(shots: Sequence[Shot], sizes: Sequence[tuple[int, int]]) -> Camera:
-    check_positions(shots)
+def _cameras(shots: Sequence[Shot], sizes: Sequence[tuple[int, int]], origin: Origin | None) -> Camera:
+    check_positions(shots, origin)
     factors = np.array(sizes) / np.array([shot.size for shot in shots])
     return Camera(
         jnp.asarray(np.stack([shot.world_to_cam for shot in shots])),

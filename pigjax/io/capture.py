@@ -1,4 +1,4 @@
-"""What every camera format comes down to: one `Shot` per photo, with the checks that they share."""
+"""The common form of all camera formats: one `Shot` per photo, with shared checks."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pigjax.core.errors import InputError
+from pigjax.io.origin import Origin, checked_origin, proper_origin, remedy_for
 
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 _PHOTO_SUFFIXES = frozenset(
@@ -65,7 +66,7 @@ class Capture:
     root: Path  # folder in which `object_mask` lies
     shots: tuple[Shot, ...]
     points: Path | None
-    remarks: tuple[str, ...] = ()  # of what the file says and nothing here applies, for a warning
+    remarks: tuple[str, ...] = ()  # on fields of the file that nothing here applies, for a warning
 
 
 def normal_path(name: str) -> str:
@@ -203,33 +204,40 @@ def rigid(matrix: Any, where: str) -> Float[np.ndarray, "4 4"]:
     return pose
 
 
-def check_positions(shots: Sequence[Shot]) -> None:
+def check_positions(shots: Sequence[Shot], origin: Origin | None = None) -> None:
     """Refuse cameras so far from the origin that floats of the present width round their distances away.
 
     Positions are read as 64-bit floats and kept as JAX's default float. Rounding beyond 1e-4 of the cameras' extent
     gives a warning, beyond 1e-3 an error; cameras that all stand in one place count as 10 m apart.
 
+    Args:
+        shots: with the origin subtracted already.
+        origin: which that was [m], for the message.
+
     Raises:
-        InputError: the offset is too large; the message names it.
+        InputError: the offset is too large; the message names the origin that takes it away.
     """
     positions = np.stack([-shot.world_to_cam[:3, :3].T @ shot.world_to_cam[:3, 3] for shot in shots])
     middle = np.median(positions, axis=0)
     with np.errstate(over="ignore"):
         extent = float(np.max(np.linalg.norm(positions - middle, axis=1))) * 2
         farthest = float(np.max(np.linalg.norm(positions, axis=1)))
-    step = farthest * float(np.finfo(jnp.result_type(float)).eps)
+    width = np.finfo(jnp.result_type(float))
+    step = farthest * float(width.eps)
     if extent < 1e-9 * farthest:
         extent = 10.0
     if step <= _COARSE * extent < np.inf:
         return
-    offset = ", ".join(f"{value:.10g}" for value in middle)
+    start = np.zeros(3) if origin is None else checked_origin(origin)
+    offset = ", ".join(f"{value:.10g}" for value in start + middle)
     said = (
         f"{shots[0].where.partition(': ')[0]}: cameras lie around ({offset}), {extent:.3g} m apart, where"
-        f" 32-bit floats are {step:.2g} m apart; subtract this offset from the camera positions and from the Gaussians"
+        f" {width.bits}-bit floats are {step:.2g} m apart;"
+        f" {remedy_for(start + proper_origin(positions), 'the Gaussians')}."
     )
     if not step <= _TOO_COARSE * extent < np.inf:
-        raise InputError(said + ".")
-    warnings.warn(said + " for exact pictures.", stacklevel=4)
+        raise InputError(said)
+    warnings.warn(said, stacklevel=4)
 
 
 def check_pinhole(model: str, fields: Mapping[str, Any], where: str, known: tuple[str, ...]) -> None:

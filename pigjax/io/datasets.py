@@ -19,6 +19,7 @@ from pigjax.io.files import PathLike, decoding, existing, existing_folder, read_
 from pigjax.io.images import open_image
 from pigjax.io.mask_json import ID_LIMIT, frame_order
 from pigjax.io.masks import load_masks
+from pigjax.io.origin import Origin
 
 Truth = Bool[np.ndarray, "_ _"]  # of the size that it is stored in
 _PHOTOS = (".png", ".jpg", ".jpeg")
@@ -37,7 +38,7 @@ class Dataset(NamedTuple):
 
 
 class _Truths(NamedTuple):
-    """What each layout comes down to."""
+    """The common form of all layouts."""
 
     test: list[str]  # views that must not vote
     masks: dict[tuple[str, str], Truth]
@@ -53,6 +54,7 @@ def load_dataset(
     vote: bool = True,
     max_size: int | None = None,
     holes: int = 0,
+    origin: Origin | None = None,
 ) -> Dataset:
     """Views that vote, and truth by (view, prompt), of a labelled scene. Host.
 
@@ -61,7 +63,7 @@ def load_dataset(
       eighth where there is no such folder. A mask is where a pixel is > 128.
     - "3d-ovs" (Liu et al. 2023): `segmentations/classes.txt` and `segmentations/<number>/<class>.png`, where the number
       counts the files in `images` in the order of names. A mask is where a pixel is 255.
-    - "views": any posed photos; truth is what `object_mask` holds in the test split, with the names of `names.json`
+    - "views": any posed photos; truth is `object_mask` of the test split, with the names of `names.json`
       {id: name}.
 
     Pictures of zeros and ones are masks as well. Views with truth never vote. As in Gaussian Grouping's data, where
@@ -75,22 +77,24 @@ def load_dataset(
         vote: False leaves them unread.
         max_size: shrink photos so that neither side is longer [px].
         holes: see `load_masks`.
+        origin: see `load_views`; the same that is given to `load_gaussians`.
 
     Raises:
         MissingFileError: a file or folder of the layout does not exist.
-        InputError: unknown layout, a damaged file, or nothing can vote or be scored.
+        InputError: unknown layout, a damaged file, cameras so far from the origin that they coincide when rounded, or
+            nothing can vote or be scored.
     """
     if layout not in LAYOUTS:
         raise InputError(f"format = {layout!r}: choose from {', '.join(LAYOUTS)}.")
     root = existing_folder(path, "data set")
-    cameras, views = load_cameras(root, max_size=max_size)
-    found = LAYOUTS[layout](root, sorted(views))
+    cameras, views = load_cameras(root, max_size=max_size, origin=origin)
+    found = LAYOUTS[layout](root, sorted(views), origin)
     truths = {key: mask for key, mask in found.masks.items() if mask.any()}
     if not truths:
         raise InputError(f"{root}: no truth mask of its {len(found.masks)} shows anything; check the test views.")
     black = [f"truth {view}/{prompt}" for view, prompt in found.masks if (view, prompt) not in truths]
     with_truth = {view for view, _ in truths}
-    test = load_views(root, only=[view for view in views if view in with_truth], max_size=max_size)
+    test = load_views(root, only=[view for view in views if view in with_truth], max_size=max_size, origin=origin)
     names = found.names if masks is None else {}
     if not vote:
         return Dataset(None, None, test, truths, names, tuple(black))
@@ -149,7 +153,7 @@ def id_named(name: str, names: Mapping[int, str]) -> int | None:
     return found[0] if found else None
 
 
-def _lerf_mask(root: Path, views: Sequence[str]) -> _Truths:
+def _lerf_mask(root: Path, views: Sequence[str], origin: Origin | None) -> _Truths:
     truths = existing_folder(root / "test_mask", "folder of truth masks (LERF-Mask)")
     folders = sorted(folder for folder in truths.iterdir() if folder.is_dir())
     train = root / "images_train"
@@ -177,7 +181,7 @@ def _view_of(folder: Path, views: Sequence[str], test: Sequence[str]) -> str:
     raise InputError(f"{folder}: is no view: neither a name nor a number from 0 to {len(test) - 1} of the test views.")
 
 
-def _3d_ovs(root: Path, views: Sequence[str]) -> _Truths:
+def _3d_ovs(root: Path, views: Sequence[str], origin: Origin | None) -> _Truths:
     truths = existing_folder(root / "segmentations", "folder of truth masks (3D-OVS)")
     listing = existing(truths / "classes.txt", "list of classes")
     with decoding(listing, "list of classes", remedy="write it in UTF-8"):
@@ -196,9 +200,9 @@ def _3d_ovs(root: Path, views: Sequence[str]) -> _Truths:
     return _Truths([view for view, _ in masks], masks, {})
 
 
-def _labelled_views(root: Path, views: Sequence[str]) -> _Truths:
+def _labelled_views(root: Path, views: Sequence[str], origin: Origin | None) -> _Truths:
     names = load_names(root / "names.json")
-    test = load_views(root, masks=True, split="test")
+    test = load_views(root, masks=True, split="test", origin=origin)
     assert test.masks is not None
     masks = {
         (view, name): np.asarray(mask) == number
@@ -209,7 +213,7 @@ def _labelled_views(root: Path, views: Sequence[str]) -> _Truths:
     return _Truths(list(test.names), masks, names)
 
 
-LAYOUTS: dict[str, Callable[[Path, Sequence[str]], _Truths]] = {
+LAYOUTS: dict[str, Callable[[Path, Sequence[str], Origin | None], _Truths]] = {
     "lerf-mask": _lerf_mask,
     "3d-ovs": _3d_ovs,
     "views": _labelled_views,

@@ -6,8 +6,10 @@ import json
 import os
 import re
 import shutil
+import struct
 import tomllib
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -61,7 +63,7 @@ def decoding(path: PathLike, what: str, *, remedy: str = "copy or export it agai
     Args:
         path: the file, which the message names.
         what: the kind of file: "PLY file", "mask".
-        remedy: what the reader of the message can do.
+        remedy: advice to the reader of the message.
 
     Raises:
         InputError: the block raised anything but an InputError.
@@ -73,7 +75,7 @@ def decoding(path: PathLike, what: str, *, remedy: str = "copy or export it agai
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({_said(error)}); {remedy}.") from error
     except Exception as error:
-        raise InputError(f"{path}: not a readable {what} ({_reason(error)}); {remedy}.") from error
+        raise InputError(f"{path}: not a readable {what} ({reason_of(error)}); {remedy}.") from error
 
 
 def read_json(path: PathLike) -> Any:
@@ -81,11 +83,16 @@ def read_json(path: PathLike) -> Any:
 
     Raises:
         MissingFileError: there is no such file.
-        InputError: the file is not JSON, or nested too deeply.
+        InputError: the file is not JSON, nested too deeply, names a key twice, or has texts that no file or screen can
+            hold: those with half of a pair of code units, such as "\\ud800".
     """
     path = existing(path, "file")
     with decoding(path, "JSON file", remedy="mend it or write it again"):
-        return json.loads(path.read_text(encoding="utf-8-sig"))
+        text = path.read_text(encoding="utf-8-sig")
+        content = json.loads(text, object_pairs_hook=_unique)
+        if _SURROGATE.search(text) and (half := _first_half(content)):
+            raise ValueError(f"a text holds {half}, half of a character")
+        return content
 
 
 def read_toml(path: PathLike) -> dict[str, Any]:
@@ -155,7 +162,7 @@ def writing(path: PathLike) -> Iterator[Path]:
 
 
 def write_text(path: PathLike, text: str) -> None:
-    """Write a text file in UTF-8, whole or not at all; what UTF-8 cannot hold becomes U+FFFD.
+    """Write a text file in UTF-8, whole or not at all; characters beyond UTF-8 become U+FFFD.
 
     Raises:
         InputError: the file cannot be written.
@@ -165,7 +172,7 @@ def write_text(path: PathLike, text: str) -> None:
 
 
 def write_toml(path: PathLike, content: Any) -> None:
-    """Write nested dicts of strings, numbers and lists as TOML; what UTF-8 cannot hold becomes U+FFFD, with a warning.
+    """Write nested dicts of strings, numbers and lists as TOML; characters beyond UTF-8 become U+FFFD, with a warning.
 
     Raises:
         InputError: the file cannot be written, or something in it has no TOML form.
@@ -173,7 +180,9 @@ def write_toml(path: PathLike, content: Any) -> None:
     try:
         text = tomli_w.dumps(content)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: content has no TOML form ({_reason(error)}); give plain numbers or text.") from error
+        raise InputError(
+            f"{path}: content has no TOML form ({reason_of(error)}); give plain numbers or text."
+        ) from error
     if _whole_text(text) != text:
         warnings.warn(f"{path}: a path in it is not UTF-8, as TOML asks; rename that folder.", stacklevel=2)
     write_text(path, text)
@@ -190,7 +199,7 @@ def output_folder(path: PathLike, *, files: Sequence[str] = (), folders: Sequenc
         folders: names of folders that will be made in it.
 
     Raises:
-        InputError: a file is in its place, a folder is in the place of one of its files or the other way round, or it
+        InputError: a file is in its place, a folder is in the place of one of its files or vice versa, or it
             cannot be made or written.
     """
     path = Path(path)
@@ -306,14 +315,66 @@ def _runs(process: int) -> bool:
     return True
 
 
-def _reason(error: BaseException) -> str:
-    said = str(error).strip().splitlines()
-    return said[0][:200] if said else type(error).__name__
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Entries of a JSON object, where a key that is written twice would hide the first value."""
+    entries = dict(pairs)
+    if len(entries) < len(pairs):
+        twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"the key {twice[:40]!r} is written twice")
+    return entries
+
+
+def reason_of(error: BaseException) -> str:
+    """What a decoder's error means for the file, in one line and without what concerns only Python."""
+    said = (str(error).strip().splitlines() or [""])[0]
+    if isinstance(error, UnicodeDecodeError):
+        return f"byte {error.start} is not {error.encoding.upper()}"
+    if isinstance(error, KeyError) and error.args:
+        return f"it has no {repr(error.args[0])[:40]}"
+    for pattern, meaning in _MEANINGS.items():
+        if found := re.search(pattern, said):
+            return found.expand(meaning)
+    if said.startswith("Error at leaf") and error.__cause__ is not None:  # equinox, around what a leaf's reader raised
+        return reason_of(error.__cause__)
+    named = next((meaning for kind, meaning in _MEANINGS_OF_KINDS.items() if isinstance(error, kind)), None)
+    return named or said[:200] or type(error).__name__
+
+
+# Patterns of messages of Python and NumPy
+_MEANINGS = {
+    r"^Exceeds the limit \((\d+) digits\)": r"a number has more than \1 digits",
+    r"^invalid literal for int\(\) with base 10: (.{1,40})": r"\1 is no whole number",
+    r"^could not convert string(?: to float:)? (.{1,40})": r"\1 is no number",
+    r"(too large|too big) to convert": "a number is too large",
+    r"^(not enough|too many) values to unpack": r"an entry has \1 parts",
+    r"^subsection not found": "it ends too early",
+    r"[Pp]ython objects|pickled \(object\)": "it holds Python objects",
+}
+_MEANINGS_OF_KINDS = {
+    RecursionError: "it is nested too deeply",
+    struct.error: "it ends too early",
+    StopIteration: "it ends too early",
+    TypeError: "an entry has another form than it should have",
+    AttributeError: "an entry has another form than it should have",
+    IndexError: "an entry has another form than it should have",
+}
 
 
 def _said(error: BaseException) -> str:
     """Message of the operating system without the path."""
-    return (error.strerror if isinstance(error, OSError) else None) or _reason(error)
+    return (error.strerror if isinstance(error, OSError) else None) or reason_of(error)
+
+
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
+
+
+def _first_half(content: Any) -> str | None:
+    """The first lone surrogate in the texts of a nest, as JSON spells it."""
+    try:
+        json.dumps(content, ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        return f"\\u{ord(error.object[error.start]):04x}"
+    return None
 
 
 def _whole_text(value: Any) -> Any:

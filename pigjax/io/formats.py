@@ -63,6 +63,9 @@ def origin_of(path: PathLike) -> tuple[float, float, float]:
 
     It is 0, 0, 0 where float32 holds the positions well enough as they are.
 
+    Args:
+        path: file of Gaussians or points; positions in m.
+
     Raises:
         MissingFileError: there is no such file.
         InputError: the file is damaged.

@@ -9,14 +9,17 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float, UInt8
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, UnidentifiedImageError
 
 from pigjax.core.arguments import checked
+from pigjax.core.checks import Limits, shown
 from pigjax.core.errors import InputError
 from pigjax.io.files import PathLike, decoding, existing, writing
 
 _ORIENTATION = 0x0112  # EXIF tag: 1 as stored, 2 to 4 mirrored or upside down, 5 to 8 width and height exchanged
 _SIDEWAYS = 5
+# that photos and masks have; others are refused, of which some start programs (EPS: Ghostscript) or read other files
+_FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "TIFF", "BMP", "DIB", "GIF", "PPM", "TGA", "JPEG2000")
 _MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX")
 Background = float | int | tuple[float, float, float]
 # [h w 3] or [h w]; sizes have no names, so that a bad frame meets our own message rather than a type checker's.
@@ -46,7 +49,7 @@ def open_image(path: PathLike, *, check: Callable[[int, int], None] | None = Non
         InputError: the file is not a picture, is damaged, or holds several pictures, or `check` says so.
     """
     path = existing(path, "image")
-    with _decoding(path), Image.open(path) as image:
+    with _decoding(path), _opened(path) as image:
         if check is not None:
             check(*image.size)
         if getattr(image, "is_animated", False) and image.format != "MPO":  # a phone's second picture is a preview
@@ -63,8 +66,18 @@ def image_size(path: PathLike) -> tuple[int, int]:
         InputError: the file is not a picture.
     """
     path = existing(path, "image")
-    with _decoding(path), Image.open(path) as image:
+    with _decoding(path), _opened(path) as image:
         return image.size
+
+
+def _opened(path: PathLike) -> Image.Image:
+    """A picture of a known format, whatever the name of its file says."""
+    Image.init()
+    known = [name for name in _FORMATS if name in Image.OPEN]  # Pillow may be built without some
+    try:
+        return Image.open(path, formats=known)
+    except UnidentifiedImageError:
+        raise ValueError(f"none of {', '.join(known)}") from None
 
 
 @contextmanager
@@ -91,8 +104,11 @@ def open_rgb(
 
     Raises:
         MissingFileError: there is no such file.
-        InputError: the file is not an 8-bit picture, is damaged, or has another size.
+        InputError: the file is not an 8-bit picture, is damaged, or has another size, or the background is no colour.
     """
+
+    if (rule := Limits(0, 1).broken(background)) is not None:
+        raise InputError(f"{path}: background = {shown(background)}: {rule}.")
 
     def check(*stored: int) -> None:
         if size is not None and size not in (stored, stored[::-1]):
@@ -122,7 +138,7 @@ def turned_by_exif(path: PathLike) -> bool:
         InputError: the file is not a picture.
     """
     path = existing(path, "image")
-    with _decoding(path), Image.open(path) as image:
+    with _decoding(path), _opened(path) as image:
         orientation = image.getexif().get(_ORIENTATION, 1)
         return 1 < orientation < _SIDEWAYS or (_SIDEWAYS <= orientation <= 8 and image.width == image.height)
 
@@ -143,7 +159,7 @@ def write_image(path: PathLike, image: Picture) -> None:
         image: [h w 3], [h w 4] or [h w].
 
     Raises:
-        InputError: what is no picture, the suffix names no picture format, or the file cannot be written.
+        InputError: an array is no picture, the suffix names no picture format, or the file cannot be written.
     """
     values = to_uint8(image, name=f"{path}: image")
     if not (values.ndim == 2 or (values.ndim == 3 and values.shape[-1] in (3, 4))):

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Integer, Num
 
-from pigjax.core.errors import InputError, MissingFileError
+from pigjax.core.errors import InputError
 from pigjax.io.archives import ArrayHeader, load_arrays, save_arrays
 from pigjax.io.files import PathLike
 from pigjax.io.provenance import digest
@@ -44,7 +44,7 @@ def save_labels(
         votes: views, or sums of alpha·T, for each id.
         confidence: share of the votes that the winner took, 0 to 1.
         ids: id of each column of `votes`; None: column k counts id k.
-        scene: of `digest_of_scene`, by which labels of other Gaussians are told; None: they cannot be told.
+        scene: of `digest_of_scene`, to recognise labels of other Gaussians; None: they are not recognised.
 
     Raises:
         InputError: the file cannot be written.
@@ -77,14 +77,7 @@ def load_labels(path: PathLike, count: int | None = None, *, scene: str | None =
     def check(headers: Mapping[str, ArrayHeader]) -> None:
         _check_headers(path, headers, count)
 
-    try:
-        arrays = load_arrays(path, _WHAT, remedy=_REMEDY, check=check)
-    except MissingFileError:
-        raise
-    except InputError as error:
-        if error.__cause__ is None:
-            raise
-        raise InputError(f"{path}: not the {_WHAT} ({error.__cause__}); {_REMEDY}.") from error
+    arrays = load_arrays(path, _WHAT, remedy=_REMEDY, check=check)
     labels = StoredLabels(arrays["object_id"], arrays["votes"], arrays["confidence"], arrays.get("ids"))
     if scene is not None and "scene" in arrays and str(arrays["scene"]) != scene:
         raise InputError(f"{path}: labels the Gaussians of another file, as many as the scene has; segment it again.")
@@ -95,6 +88,14 @@ def load_labels(path: PathLike, count: int | None = None, *, scene: str | None =
         raise InputError(f"{path}: votes are negative or not finite; {_REMEDY}.")
     if not ((labels.confidence >= 0) & (labels.confidence <= 1 + 1e-3)).all():  # sums of shares are rounded
         raise InputError(f"{path}: confidence is not a share from 0 to 1; {_REMEDY}.")
+    if labels.ids is not None and len(labels.ids):
+        ids = labels.ids
+        if not (int(ids.min()) >= 0 and int(ids.max()) < 2**31 and (ids[1:] > ids[:-1]).all()):
+            raise InputError(f"{path}: ids are not whole numbers from 0 to 2³¹ - 1 in rising order; {_REMEDY}.")
+    known = np.arange(labels.votes.shape[1]) if labels.ids is None else labels.ids
+    strange = np.setdiff1d(labels.object_id, np.append(known, (-1, 0)))
+    if len(strange):
+        raise InputError(f"{path}: object_id holds {strange[0]}, for which votes have no column; {_REMEDY}.")
     return labels._replace(object_id=labels.object_id.astype(np.int32))
 
 
@@ -106,13 +107,12 @@ def _check_headers(path: PathLike, headers: Mapping[str, ArrayHeader], count: in
         kinds["ids"] = ("iu", 1, "whole numbers [m]")
     missing = [name for name in kinds if name not in headers]
     if missing:
-        raise InputError(f"{path}: not the {_WHAT} (it has no {missing[0]}); {_REMEDY}.")
+        raise InputError(f"{path}: not a readable {_WHAT} (it has no {missing[0]}); {_REMEDY}.")
     for name, (kind, axes, wanted) in kinds.items():
         found = headers[name]
         if found.dtype.kind not in kind or len(found.shape) != axes:
-            raise InputError(
-                f"{path}: not the {_WHAT} ({name} is {found.dtype} {list(found.shape)}, not {wanted}); {_REMEDY}."
-            )
+            told = f"{name} is {found.dtype} {list(found.shape)}, not {wanted}"
+            raise InputError(f"{path}: not a readable {_WHAT} ({told}); {_REMEDY}.")
     rows = {name: headers[name].shape[0] for name in kinds if name != "ids"}
     if "ids" in headers and headers["ids"].shape[0] != headers["votes"].shape[1]:
         raise InputError(

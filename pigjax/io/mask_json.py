@@ -1,4 +1,4 @@
-"""Masks in JSON: run lengths and polygons of COCO, and what SAM and SAM 2 write with them."""
+"""Masks in JSON: run lengths and polygons of COCO, and the files of SAM and SAM 2 that use them."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -14,6 +15,7 @@ from scipy import ndimage
 
 from pigjax.core.arguments import checked
 from pigjax.core.errors import InputError, MissingFileError
+from pigjax.io.archives import ArrayHeader, load_array
 from pigjax.io.files import PathLike, decoding, existing, existing_folder, read_json, writing
 from pigjax.io.images import open_image
 from pigjax.io.mask_json import ID_LIMIT, Segments, frame_order, paint, read_view, read_views
@@ -120,12 +122,12 @@ def save_masks(folder: PathLike, names: Sequence[str], masks: Integer[np.ndarray
 def _finder(
     folder: PathLike, names: Sequence[str], frames: Sequence[str], id_field: str | None
 ) -> Callable[[str], Path | Segments | None]:
-    """What gives the file, or the annotations, of a view."""
+    """A function that gives the file, or the annotations, of a view."""
     if Path(folder).suffix.lower() == ".json":
         return read_views(existing(folder, "JSON of masks"), frames, id_field).get
     folder = existing_folder(folder, "folder of masks")
     candidates = {name: [folder / f"{name}{suffix}" for suffix in (".png", ".npy", ".json")] for name in names}
-    files = {name: next((path for path in paths if path.is_file()), None) for name, paths in candidates.items()}
+    files = {name: next((path for path in paths if os.path.isfile(path)), None) for name, paths in candidates.items()}
     listings = [path for path in folder.glob("*.json") if path.name != "pred.json"]
     if len(listings) == 1 and not any(files.values()):
         return read_views(listings[0], frames, id_field).get
@@ -164,12 +166,12 @@ def _read_ids(found: Path | Segments, size: tuple[int, int]) -> tuple[Path | str
 
 
 def _read_array(path: Path, check: Callable[[Path, int, int], None]) -> np.ndarray:
-    with decoding(path, ".npy array", remedy="save the mask again"):
-        stored = np.load(path, mmap_mode="r", allow_pickle=False)  # mapped: a shape beyond the file asks for no memory
-        if stored.ndim == 2:
-            check(path, *stored.shape)
-            return np.array(stored)
-    raise InputError(f"{path}: mask is {stored.dtype} {stored.shape}; save whole-number ids [h, w].")
+    def check_header(header: ArrayHeader) -> None:
+        if len(header.shape) != 2:
+            raise InputError(f"{path}: mask is {header.dtype} {header.shape}; save whole-number ids [h, w].")
+        check(path, *header.shape)
+
+    return load_array(path, ".npy array", remedy="save the mask again", check=check_header)
 
 
 def _read_picture(path: Path, check: Callable[[Path, int, int], None]) -> np.ndarray:

@@ -65,10 +65,7 @@ def shifted(path: PathLike, positions: Float[np.ndarray, "n 3"], origin: Origin 
     rounding = _rounding(local)
     least = min(_COARSE, _COARSE_SHARE * extent) if extent > 0 else _COARSE
     point = ", ".join(f"{value:.12g}" for value in start + far)
-    remedy = (
-        f"give origin=({point}), which is subtracted, for the cameras too (--origin {point.replace(',', '')},"
-        f" or input.origin = [{point}] in a scene file)"
-    )
+    remedy = remedy_for(start + far, "the cameras")
     if rounding > least and rounding > _GAIN * _rounding(local - far):
         raise InputError(
             f"{path}: coordinates lie around ({point}), where float32 rounds them by {2 * rounding:.1g} m; {remedy}."
@@ -82,6 +79,15 @@ def shifted(path: PathLike, positions: Float[np.ndarray, "n 3"], origin: Origin 
         )
     with np.errstate(over="ignore"):
         return local.astype(np.float32)
+
+
+def remedy_for(origin: Float[np.ndarray, "3"], others: str) -> str:
+    """What to do about positions that lie around a point [m], for the positions of `others` too."""
+    point = ", ".join(f"{value:.12g}" for value in origin)
+    return (
+        f"give origin=({point}), which is subtracted, for {others} too (--origin {point.replace(',', '')},"
+        f" or input.origin = [{point}] in a scene file)"
+    )
 
 
 def fits_float32(positions: Float[np.ndarray, "n 3"]) -> bool:

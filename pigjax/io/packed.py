@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from pigjax.core.errors import InputError
-from pigjax.io.files import PathLike, decoding, existing
+from pigjax.io.files import PathLike, decoding, existing, reason_of
 from pigjax.io.ply_table import Header
 
 _CHUNK = 256  # splats that share bounds
@@ -77,7 +77,7 @@ def read_spz(path: PathLike) -> dict[str, np.ndarray]:
     try:
         return _columns(gsply.read_spz(path))
     except Exception as error:  # its decoders raise whatever numpy, gzip or struct do
-        raise _damaged(path, str(error)) from error
+        raise _damaged(path, reason_of(error)) from error
 
 
 def _gsply(path: Path) -> Any:
@@ -99,7 +99,7 @@ def _check_spz(path: Path, raw: bytes) -> None:
         try:
             start = unpacked.decompress(raw, 16)
         except zlib.error as error:
-            raise _damaged(path, str(error)) from error
+            raise _damaged(path, reason_of(error)) from error
     if len(start) < 16 or start[:4] != b"NGSP":
         raise _damaged(path, "no .spz header")
     version, count, degree, _, flags = struct.unpack("<IIBBB", start[4:15])
@@ -110,7 +110,7 @@ def _check_spz(path: Path, raw: bytes) -> None:
         try:
             unpacked.decompress(unpacked.unconsumed_tail, size + _SPARE)
         except zlib.error as error:
-            raise _damaged(path, str(error)) from error
+            raise _damaged(path, reason_of(error)) from error
         if unpacked.unconsumed_tail:
             raise _damaged(path, f"it unpacks to more than the {count} splats that its header counts")
     if flags & _ANTIALIASED:

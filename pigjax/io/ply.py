@@ -194,7 +194,7 @@ def _filtered(path: PathLike, kept: Columns) -> Columns:
     scales, logits = kept["log_scales"].astype(np.float64), kept["logit_opacities"].astype(np.float64)
     with np.errstate(divide="ignore"):
         wide = 0.5 * np.logaddexp(2 * scales, 2 * np.log(width))
-        factor = np.minimum((scales - wide).sum(1, keepdims=True), 0)  # logarithm of what the opacity is lowered by
+        factor = np.minimum((scales - wide).sum(1, keepdims=True), 0)  # logarithm of the factor on the opacity
         # log(o) and log(1 - o) of o = exp(factor) · sigmoid(logits)
         some = factor - np.logaddexp(0, -logits)
         rest = np.logaddexp(np.log(-np.expm1(factor)), factor - np.logaddexp(0, logits))
@@ -214,9 +214,9 @@ def save_ply(path: PathLike, gaussians: Gaussians, *, ascii: bool = False, origi
 
     Args:
         path: the file.
-        gaussians: what to write.
+        gaussians: the scene; positions in m.
         ascii: as text, which people can read, instead of binary.
-        origin: point added to the positions [m], which are then written in float64: what `load_gaussians` subtracted.
+        origin: offset that `load_gaussians` subtracted, added to the positions [m], which are then written in float64.
 
     Raises:
         InputError: the file cannot be written, or `origin` is no point.

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pigjax.core.errors import InputError
-from pigjax.io.files import PathLike, decoding, existing
+from pigjax.io.files import PathLike, decoding, existing, reason_of
 
 _NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
 _ALIASES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
@@ -112,7 +112,9 @@ def read_vertices(path: PathLike) -> tuple[dict[str, np.ndarray], Header]:
             return _text_vertices(path, header), header
         return _binary_vertices(path, header), header
     except (ValueError, IndexError, OverflowError, struct.error, StopIteration, MemoryError) as error:
-        raise InputError(f"{path}: the PLY file is truncated or damaged ({error}); copy or export it again.") from error
+        raise InputError(
+            f"{path}: the PLY file is truncated or damaged ({reason_of(error)}); copy or export it again."
+        ) from error
 
 
 def _parsed(path: PathLike, lines: list[list[str]], end: int) -> Header:

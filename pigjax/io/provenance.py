@@ -53,8 +53,8 @@ def parts_of(named: Mapping[str, Any]) -> dict[str, str]:
 def digest(*values: Any) -> str:
     """16 hexadecimal digits that tell contents apart: numbers, texts, arrays, pytrees, and functions by their code.
 
-    A function counts by its bytecode, defaults, what it closes over, and the functions and values of its own module
-    that it names; a function of a library counts by its name and what it closes over.
+    A function counts by its bytecode, defaults, closed-over values, and the functions and values of its own module
+    that it names; a function of a library counts by its name and closed-over values.
     """
     hasher = hashlib.blake2b(digest_size=8)
     seen: dict[int, Any] = {}
@@ -70,7 +70,7 @@ def file_digest(path: PathLike) -> str:
         InputError: it cannot be read.
     """
     path = Path(path)
-    if not path.exists():
+    if not os.path.exists(path):
         return "missing"
     hasher = hashlib.blake2b(digest_size=8)
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
@@ -86,7 +86,7 @@ def check_same(where: PathLike, found: Parts, parts: Parts) -> None:
     """Refuse results of other parts.
 
     Raises:
-        StaleError: naming what changed.
+        StaleError: the parts differ; it names the changes.
     """
     names = [name for name in dict.fromkeys([*found, *parts]) if found.get(name) != parts.get(name)]
     if names:
@@ -113,7 +113,7 @@ def claim(
     Args:
         folder: made where it is missing.
         parts: of `parts_of`.
-        results: patterns of what the caller leaves in the folder, "states" or "*.npz".
+        results: patterns of the caller's results in the folder, "states" or "*.npz".
         overwrite: remove results of other or unknown parts instead of refusing them.
         signed: whether all results in the folder carry the digest; asked where `provenance.json` is lost or damaged.
 
@@ -124,7 +124,8 @@ def claim(
     folder = output_folder(folder)
     key = digest(sorted(parts.items()))
     file = folder / FILE
-    old = [entry for pattern in results for entry in folder.glob(pattern)]
+    # an empty folder is what a command leaves that was refused before it had results
+    old = [entry for pattern in results for entry in folder.glob(pattern) if not _is_empty_folder(entry)]
     if old:
         found = _recorded(file)
         try:
@@ -145,6 +146,10 @@ def claim(
                 remove(entry)
     write_json(file, {"key": key, "parts": dict(parts)})
     return key
+
+
+def _is_empty_folder(path: Path) -> bool:
+    return path.is_dir() and next(path.iterdir(), None) is None
 
 
 def _recorded(file: Path) -> dict[str, str] | None:
@@ -181,7 +186,7 @@ def _take_apart(name: str, value: Any, parts: dict[str, str]) -> None:
 
 
 def _feed(hasher: Any, value: Any, seen: dict[int, Any]) -> None:
-    """Add a value to the hash; `seen` keeps what was met, so that cycles end and no id is used twice."""
+    """Add a value to the hash; `seen` keeps the values already visited, so that cycles end and no id is used twice."""
 
     def put(*texts: Any) -> None:
         for text in texts:

@@ -12,6 +12,7 @@ import json
 import os
 import warnings
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,12 +21,12 @@ import numpy as np
 from jaxtyping import Array, Shaped
 
 from pigjax.core.errors import InputError, StaleError
-from pigjax.io.archives import load_arrays, save_arrays
+from pigjax.io.archives import load_arrays, read_header, save_arrays
 from pigjax.io.files import PathLike, decoding, existing, writing
 from pigjax.io.provenance import Parts, check_same
 
 _SIGNATURE = "signature"
-STATES = "[0-9]" * 6 + "*.npz"  # pattern of what `save_state` leaves, and not of other files
+STATES = "[0-9]" * 6 + "*.npz"  # pattern of files of `save_state`, and of no others
 Tree = TypeVar("Tree")
 
 
@@ -34,7 +35,7 @@ def save_state(
 ) -> Path:
     """Write the arrays of one frame as `<frame>.npz`, whole or not at all, and give its path. Host.
 
-    `signature` says what run they belong to (a hash of the scene and its sizes).
+    `signature` names the run that they belong to (a hash of the scene and its sizes).
 
     Raises:
         InputError: an array is named "signature", or the folder cannot be written.
@@ -120,7 +121,7 @@ def save_pytree(path: PathLike, tree: Any, *, parts: Parts | None = None) -> Non
     Args:
         path: of the file.
         tree: arrays and numbers.
-        parts: of `provenance.parts_of`, what the leaves were made from; None: they depend on nothing.
+        parts: of `provenance.parts_of`, the inputs of the leaves; None: there are none.
 
     Raises:
         InputError: the file cannot be written.
@@ -152,10 +153,21 @@ def load_pytree(path: PathLike, like: Tree, *, parts: Parts | None = None) -> Tr
         check_same(path, found, parts)
     with decoding(path, "checkpoint", remedy="use the settings it was written with, or delete it"):
         file = io.BytesIO(payload)
-        tree = eqx.tree_deserialise_leaves(file, like)
+        tree = eqx.tree_deserialise_leaves(file, like, filter_spec=partial(_leaf, size=len(payload)))
         if file.read(1):
             raise ValueError("it holds more leaves")
         return tree
+
+
+def _leaf(file: io.BytesIO, like: Any, *, size: int) -> Any:
+    """A leaf as equinox reads it, once its header is known to be that of `like`, so that it asks for no more memory."""
+    if eqx.is_array_like(like):
+        at = file.tell()
+        header, wanted = read_header(file, size), np.asarray(like)
+        if header.shape != wanted.shape or header.dtype != wanted.dtype:
+            raise ValueError(f"it holds {header.dtype} {header.shape} in place of {wanted.dtype} {wanted.shape}")
+        file.seek(at)
+    return eqx.default_deserialise_filter_spec(file, like)
 
 
 def _checksum(parts: Parts, payload: bytes) -> str:
@@ -165,18 +177,18 @@ def _checksum(parts: Parts, payload: bytes) -> str:
 def resumed(path: PathLike, like: Tree, *, parts: Parts, overwrite: bool = False) -> Tree | None:
     """The tree of a checkpoint; None where there is none or it is damaged, so that all is computed again. Host.
 
-    A damaged file is told in a warning and moved aside, to the same name with ".damaged".
+    A damaged file causes a warning and is renamed to the same name with ".damaged".
 
     Args:
         path: of the checkpoint.
         like: as for `load_pytree`.
-        parts: what a checkpoint must have been made from.
+        parts: the inputs that a checkpoint must have.
         overwrite: take a checkpoint of other parts for none instead of refusing it.
 
     Raises:
         StaleError: it was made from other parts.
     """
-    if not Path(path).is_file():
+    if not os.path.isfile(path):
         return None
     try:
         return load_pytree(path, like, parts=parts)
@@ -190,7 +202,7 @@ def resumed(path: PathLike, like: Tree, *, parts: Parts, overwrite: bool = False
 
 
 def set_aside(path: PathLike, error: InputError) -> None:
-    """Move a damaged file out of the way, and warn."""
+    """Rename a damaged file, and warn."""
     path = Path(path)
     aside = path.with_name(path.name + ".damaged")
     warnings.warn(f"{error} It is kept as {aside.name}, and what it held is computed again.", stacklevel=3)

@@ -55,7 +55,7 @@ def write_video(path: PathLike, frames: Iterable[Any], *, fps: float | int) -> N
         fps: frames a second.
 
     Raises:
-        InputError: unknown suffix, fps not finite and positive, no frames, what is no picture, frames of different
+        InputError: unknown suffix, fps not finite and positive, no frames, an array is no picture, frames of different
             sizes, or the file cannot be written.
     """
     encode = {".mp4": _write_mp4, ".gif": _write_gif}.get(Path(path).suffix.lower())

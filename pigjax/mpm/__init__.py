@@ -1,4 +1,4 @@
-"""What a simulation is made of: particles and grid as users hold them, their health, and particles by law in slots."""
+"""MLS-MPM: particles and grid, P2G and G2P transfers, grid update, implicit steps, active grid, adjoint, frame loop."""
 
 from pigjax.mpm.by_law import Group, Grouping, bound_visual, group_by_law
 from pigjax.mpm.config import SimConfig
@@ -8,7 +8,7 @@ from pigjax.mpm.grid import (
     fit_grid,
     vast_grid,
 )
-from pigjax.mpm.health import Health, StepHealth, perfect_health
+from pigjax.mpm.health import Health, StepHealth
 from pigjax.mpm.layout import State, inverse, tile_order, to_chunks, to_rows
 from pigjax.mpm.particles import Particles, Trajectory, make_particles
 
@@ -28,7 +28,6 @@ __all__ = [
     "group_by_law",
     "inverse",
     "make_particles",
-    "perfect_health",
     "tile_order",
     "to_chunks",
     "to_rows",

@@ -1,13 +1,14 @@
-"""The part of the grid that a simulation needs, re-fitted from frame to frame.
+"""The active grid: the part of the domain that a simulation needs, re-fitted from frame to frame.
 
-The same matter costs the same in a small domain and in a vast one. On the host a box whose edge matter has reached
-means that the frame is computed again in a larger one; inside jit, grad and vmap its size is fixed (`SimConfig.box`).
+The same matter costs the same in a small domain and in a vast one. On the host, a frame in which matter reached the
+edge of its window is computed again in a larger one. Inside jit, grad and vmap the window has a fixed size
+(`SimConfig.box`) and moves.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,202 +16,69 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from pigjax.core.errors import SimulationError
-from pigjax.mpm import WALL, Grid, Health, Particles, SimConfig, Trajectory, perfect_health
+from pigjax.mpm import WALL, Grid, Health, Particles, SimConfig, Trajectory
 from pigjax.mpm.materials import LAWS, MaterialTable
-from pigjax.mpm.program import Box, run_frames
+from pigjax.mpm.program import GridWindow, StepInputs, run_frames
 
-_SMALL = 50_000  # nodes that need no box: less than other costs of a step
 LARGEST = 200_000_000  # nodes
-_ROOM = 1.3  # a box is made so much longer than it must be: another size is another compilation
-_ROOM_OF_ONE = 1.15  # the same of a box of fixed size, for what is faster than what was seen
+_ROOM = 1.3  # factor on the sides that a window needs: another size is another compilation
+_ROOM_OF_ONE = 1.15  # the same for a window of fixed size, for motion that is faster than the runs that sized it
 _UNIT = 4  # nodes, of which sides are multiples
-_AROUND = 6  # nodes a side of a box of fixed size more than matter was seen to need: the kernel's, and some room
+_AROUND = 6  # nodes a side of a window of fixed size beyond the extent of matter: the kernel's, and some room
 _PER_DEVICE = 4096  # particles that are worth a device of their own
 
 
-def run_in_boxes(
-    particles: Particles,
-    domain: Grid,
-    table: MaterialTable,
-    config: SimConfig,
-    *,
-    frames: int,
-    frame_dt: Float[Array, ""],
-    substeps: int,
-    choose: Callable[..., int] | None = None,
-    fit: Fit | None = None,
-    **step,
-) -> tuple[Particles, Trajectory, Health]:
-    """Simulate frame by frame, each as `fit` does, on the box that it needs; `step` is what `run_frames` takes.
-
-    `choose(particles, frame=...)` gives the substeps of each frame, where not all have the same.
-    """
-    devices = devices_for(config, len(particles))
-    step |= {"dt": frame_dt / substeps, "substeps": substeps}
-    if fit is None and choose is None and math.prod(domain.shape) <= _SMALL:
-        box, start = whole(domain), jnp.zeros_like(frame_dt)
-        return run_frames(particles, box, table, config, devices, start=start, frames=frames, **step)[:3]
-    fit = fit or Fit()
-    paths: list[Trajectory] = []
-    healths: list[Health] = []
-    for frame in range(frames):
-        before = particles
-        if choose is not None:
-            substeps = choose(particles, frame=frame)
-            step |= {"dt": frame_dt / substeps, "substeps": substeps}
-        particles, path, health = fit.frame(
-            particles, domain, table, config, devices, start=frame_dt * frame, frames=1, **step
-        )
-        stops = config.stop and health.first_bad_frame >= 0
-        if stops and paths:  # the last good frame to the digit, where a box's origin would round it anew
-            particles, path = before, paths[-1]
-        paths.append(path)
-        healths.append(health)
-        if stops:
-            paths += [path] * (frames - frame - 1)
-            break
-    joined = jax.tree.map(lambda *pieces: jnp.concatenate(pieces), *paths)
-    return particles, joined, _worst(healths)
-
-
-def run_in_one_box(
-    particles: Particles,
-    domain: Grid,
-    table: MaterialTable,
-    config: SimConfig,
-    *,
-    frames: int,
-    **step,
-) -> tuple[Particles, Trajectory, Health]:
-    """The same inside jit, grad and vmap: a box of `config.box` nodes, or the whole domain, moves with matter.
-
-    What is faster than a box allows is held back at its edge and counted as escaped.
-    """
-    devices = devices_for(config, len(particles))
-    shape = None if config.box is None else tuple(map(min, config.box, domain.shape))
-    if shape is None or shape == domain.shape:
-        start = jnp.zeros_like(step["dt"])
-        return run_frames(particles, whole(domain), table, config, devices, start=start, frames=frames, **step)[:3]
-    duration = step["dt"] * step["substeps"]
-
-    def frame(carry, number):
-        before, worst, stopped = carry
-        box = _box_around(before, table, domain, shape, duration, step["gravity"])
-        after, path, health, _ = run_frames(
-            before, box, table, config, devices, start=duration * number, frames=1, of=frames, **step
-        )
-        bad = health.first_bad_frame >= 0
-        if config.stop:  # the last good frame to the digit, where a box's origin would round it anew
-            stopped = stopped | bad
-            after = jax.tree.map(lambda new, old: jnp.where(stopped, old, new), after, before)
-            kept = Trajectory(before.x[None], before.v[None], before.F_visual[None])
-            path = jax.tree.map(lambda new, old: jnp.where(stopped, old, new), path, kept)
-        return (after, worst.worse(health.of_step()), stopped), (jax.tree.map(lambda rows: rows[0], path), bad)
-
-    carry = (particles, perfect_health(particles.x.dtype), jnp.zeros((), bool))
-    (end, worst, _), (path, bad) = lax.scan(frame, carry, jnp.arange(frames))
-    return end, path, Health(**vars(worst), substeps=jnp.asarray(step["substeps"]), first_bad_frame=_first(bad))
-
-
-def box_for(
-    runs: Iterable[tuple[Particles, Trajectory, float, Any]], table: MaterialTable, domain: Grid
-) -> tuple[int, int, int] | None:
-    """Nodes a side of a `SimConfig.box` for simulations like those that were seen, None where it would not pay. Host.
-
-    Args:
-        runs: particles at the start, their path, the duration of a frame [s] and gravity [m/s²].
-        table: materials, of which those that move count.
-        domain: the grid.
-    """
-    half = np.zeros(3)
-    for particles, path, duration, gravity in runs:
-        moving = _moving(particles, table)
-        x = np.concatenate([np.asarray(particles.x)[None], np.asarray(path.x)])[:, moving]
-        v = np.concatenate([np.asarray(particles.v)[None], np.asarray(path.v)])[:, moving]
-        for here, velocity, there in zip(x[:-1], v[:-1], x[1:]):
-            both = np.concatenate([here, _after(here, velocity, duration, np.asarray(gravity))])
-            both, there = (points[np.isfinite(points).all(-1)] for points in (both, there))
-            if len(both):
-                middle = (both.min(0) + both.max(0)) / 2
-                half = np.maximum(half, np.abs(np.concatenate([both, there]) - middle).max(0))
-    needed = np.ceil(2 * half / float(domain.dx)) + _AROUND
-    nx, ny, nz = map(int, np.clip(np.ceil(needed * _ROOM_OF_ONE), 2 * WALL + 2, domain.shape))
-    return (nx, ny, nz) if 2 * _nodes((nx, ny, nz)) <= _nodes(domain.shape) else None
-
-
-def _box_around(particles, table, domain, shape, duration, gravity):
-    """A box of a given size whose middle is that of where moving matter is and is heading."""
-    low, high = _ends(particles.x, particles.v, duration, gravity, _moving(particles, table))
-    middle = (jnp.where(low <= high, (low + high) / 2, domain.origin) - domain.origin) / domain.dx
-    sides = np.array(domain.shape)
-    half = (jnp.asarray(shape, middle.dtype) - 1) / 2
-    first = lax.stop_gradient(jnp.clip(jnp.round(middle - half), 0, sides - shape))
-    grid = Grid(domain.origin + domain.dx * first, domain.dx, shape)
-    return Box(grid, first.astype(jnp.int32), jnp.asarray(sides, jnp.int32))
-
-
-def _moving(particles, table):
-    """Which particles are of a law that moves; in the form (numpy or JAX) of their materials."""
-    still = [row for row, law in enumerate(table.laws) if LAWS[law].respond is None]
-    return sum(particles.material == row for row in still) == 0 if still else particles.material >= 0
-
-
-def whole(domain: Grid) -> Box:
-    """The box that is all of the domain."""
-    return Box(domain, jnp.zeros(3, jnp.int32), jnp.asarray(domain.shape, jnp.int32))
-
-
-def devices_for(config: SimConfig, count: int) -> int:
-    """How many local devices share so many particles."""
-    if config.devices is not None:
-        return config.devices
-    if jax.sharding.get_abstract_mesh().manual_axes:  # somebody else shares out the devices already
-        return 1
-    return max(1, min(jax.local_device_count(), count // _PER_DEVICE))
-
-
 @dataclass
-class Fit:
-    """Frames of one simulation: what the last one has taught about the size of the box."""
+class ActiveGrid:
+    """The active grid of one simulation, sized by its previous frames."""
 
-    shape: tuple[int, int, int] = (0, 0, 0)
-    slack: float = 2.0  # cells around where matter is and is heading
+    shape: tuple[int, int, int] = (0, 0, 0)  # nodes of the window of the last frame
+    slack: float = 2.0  # cells around the positions of matter now and after free flight
 
     def frame(
-        self, particles: Particles, domain: Grid, table: MaterialTable, config: SimConfig, devices: int, **step
+        self,
+        particles: Particles,
+        domain: Grid,
+        table: MaterialTable,
+        config: SimConfig,
+        devices: int,
+        inputs: StepInputs,
     ) -> tuple[Particles, Trajectory, Health]:
-        """One frame, as often as it takes.
+        """One frame, repeated in larger windows until no edge of the window holds matter back (host).
+
+        Returns the particles after it, their path of one entry, and the health.
 
         Raises:
             SimulationError: matter has spread so far that its grid would not fit into memory.
         """
-        ends = _ends(particles.x, particles.v, step["dt"] * step["substeps"], step["gravity"])
+        ends = _ends(particles.x, particles.v, inputs.duration, inputs.gravity)
         while True:
-            box = self._box(np.asarray(ends, np.float64), len(particles), domain)
-            moved, path, health, met = run_frames(particles, box, table, config, devices, **step)
+            window = self._window(np.asarray(ends, np.float64), len(particles), domain)
+            moved, path, health, met = run_frames(particles, window, table, config, devices, inputs, frames=1)
             low, high = np.asarray(met).T
-            size, first = np.array(box.grid.shape), np.asarray(box.low)
+            size, first = np.array(window.grid.shape), np.asarray(window.low)
             inner = (low & (first > 0)) | (high & (first + size < np.array(domain.shape)))
-            # what crosses the box in one step, or is NaN, has broken down: no larger box would hold it
+            # a displacement of a whole window in one step, or NaN, is a breakdown: no larger window would hold it
             broken = not health.max_courant < max(self.shape)
             if broken or not inner.any():
                 return moved, path, health
             self.slack *= 2
 
     def memory(self) -> Float[np.ndarray, "n"]:
-        """All that the next frame needs of the past, for a checkpoint."""
+        """State that the next frame needs, for a checkpoint file."""
         return np.array([*self.shape, self.slack], float)
 
     def remember(self, memory: Float[np.ndarray, "n"]) -> None:
-        """Go on from a checkpoint."""
+        """Restore the state of `memory`."""
         nx, ny, nz, self.slack = map(float, memory)
         self.shape = int(nx), int(ny), int(nz)
 
-    def _box(self, ends, count, domain):
-        if (ends[0] > ends[1]).any():  # of no particle that is finite
+    def _window(self, ends: Float[np.ndarray, "2 3"], count: int, domain: Grid) -> GridWindow:
+        """The window around the corners `ends` [m] of where matter is and is heading."""
+        if (ends[0] > ends[1]).any():  # no particle is finite
             ends = np.tile(np.asarray(domain.origin, np.float64), (2, 1))
         sides = np.array(domain.shape)
         first, last = np.clip((ends - np.asarray(domain.origin, np.float64)) / float(domain.dx), 0, sides - 1)
@@ -233,19 +101,84 @@ class Fit:
         self.shape = nx, ny, nz
         origin = np.asarray(domain.origin, np.float64) + low * float(domain.dx)
         grid = Grid(jnp.asarray(origin, domain.origin.dtype), domain.dx, self.shape)
-        return Box(grid, jnp.asarray(low, jnp.int32), jnp.asarray(sides, jnp.int32))
+        return GridWindow(grid, jnp.asarray(low, jnp.int32), jnp.asarray(sides, jnp.int32))
 
 
-def _nodes(shape):
-    """Their number, in integers without limit."""
+def box_for(
+    runs: Iterable[tuple[Particles, Trajectory, float, Any]], table: MaterialTable, domain: Grid
+) -> tuple[int, int, int] | None:
+    """Nodes a side of a `SimConfig.box` for simulations like the given ones, None where it would not pay (host).
+
+    Args:
+        runs: particles at the start, their path, the duration of a frame [s] and gravity [m/s²].
+        table: materials; only those that move count.
+        domain: the whole grid.
+    """
+    half = np.zeros(3)
+    for particles, path, duration, gravity in runs:
+        moving = _moving(particles, table)
+        x = np.concatenate([np.asarray(particles.x)[None], np.asarray(path.x)])[:, moving]
+        v = np.concatenate([np.asarray(particles.v)[None], np.asarray(path.v)])[:, moving]
+        for here, velocity, there in zip(x[:-1], v[:-1], x[1:]):
+            both = np.concatenate([here, _after(here, velocity, duration, np.asarray(gravity))])
+            both, there = (points[np.isfinite(points).all(-1)] for points in (both, there))
+            if len(both):
+                middle = (both.min(0) + both.max(0)) / 2
+                half = np.maximum(half, np.abs(np.concatenate([both, there]) - middle).max(0))
+    needed = np.ceil(2 * half / float(domain.dx)) + _AROUND
+    nx, ny, nz = map(int, np.clip(np.ceil(needed * _ROOM_OF_ONE), 2 * WALL + 2, domain.shape))
+    return (nx, ny, nz) if 2 * _nodes((nx, ny, nz)) <= _nodes(domain.shape) else None
+
+
+def window_around(
+    particles: Particles, table: MaterialTable, domain: Grid, shape: tuple[int, int, int], inputs: StepInputs
+) -> GridWindow:
+    """A window of given size, centred on the positions of moving matter now and after a frame of free flight."""
+    low, high = _ends(particles.x, particles.v, inputs.duration, inputs.gravity, _moving(particles, table))
+    middle = (jnp.where(low <= high, (low + high) / 2, domain.origin) - domain.origin) / domain.dx
+    sides = np.array(domain.shape)
+    half = (jnp.asarray(shape, middle.dtype) - 1) / 2
+    first = lax.stop_gradient(jnp.clip(jnp.round(middle - half), 0, sides - shape))
+    grid = Grid(domain.origin + domain.dx * first, domain.dx, shape)
+    return GridWindow(grid, first.astype(jnp.int32), jnp.asarray(sides, jnp.int32))
+
+
+def _moving(particles: Particles, table: MaterialTable) -> Any:
+    """Which particles [p] are of a law that moves."""
+    still = [row for row, law in enumerate(table.laws) if LAWS[law].respond is None]
+    return sum(particles.material == row for row in still) == 0 if still else particles.material >= 0
+
+
+def whole(domain: Grid) -> GridWindow:
+    """The window that is all of the domain."""
+    return GridWindow(domain, jnp.zeros(3, jnp.int32), jnp.asarray(domain.shape, jnp.int32))
+
+
+def devices_for(config: SimConfig, count: int) -> int:
+    """Number of local devices that share `count` particles."""
+    if config.devices is not None:
+        return config.devices
+    if jax.sharding.get_abstract_mesh().manual_axes:  # an outer shard_map has the devices
+        return 1
+    return max(1, min(jax.local_device_count(), count // _PER_DEVICE))
+
+
+def _nodes(shape: Iterable[Any]) -> int:
+    """Number of nodes, in Python's integers, which do not overflow."""
     return math.prod(map(int, shape))
 
 
 @jax.jit
-def _ends(x, v, duration, gravity, counts=True):
-    """Lowest and highest corner [2 3] of where particles are, and would be after a while of free flight.
+def _ends(
+    x: Float[Array, "p 3"],
+    v: Float[Array, "p 3"],
+    duration: Float[Array, ""],
+    gravity: Float[Array, "3"],
+    counts: Bool[Array, "p"] | bool = True,
+) -> Float[Array, "2 3"]:
+    """Lowest and highest corner [m] of the particles' positions now and after free flight of a duration [s].
 
-    What is not finite is left out, and what does not count; of no particle at all the lowest corner is the higher one.
+    Particles that are not finite or do not count are left out; without particles the lowest corner is the higher one.
     """
     both = jnp.stack([x, _after(x, v, duration, gravity)])
     known = (jnp.isfinite(both).all(-1) & counts)[..., None]
@@ -253,18 +186,6 @@ def _ends(x, v, duration, gravity, counts=True):
     return jnp.stack([low.min((0, 1)), high.max((0, 1))])
 
 
-def _after(x, v, duration, gravity):
-    """Positions after a while of free flight."""
+def _after(x: Any, v: Any, duration: Any, gravity: Any) -> Any:
+    """Positions after free flight of a duration [s]."""
     return x + v * duration + 0.5 * gravity * duration**2
-
-
-def _worst(healths):
-    worst = healths[0]
-    for health in healths[1:]:
-        worst = worst.worse(health)
-    bad = jnp.stack([health.first_bad_frame >= 0 for health in healths])
-    return Health(**(vars(worst) | {"first_bad_frame": _first(bad)}))
-
-
-def _first(bad):
-    return jnp.where(bad.any(), jnp.argmax(bad), -1)

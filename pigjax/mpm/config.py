@@ -44,7 +44,8 @@ class SimConfig(eqx.Module):
     # momentum out of balance, relative to what drives the step
     newton_tolerance: float = static_field(default=1e-3, limits=Limits(0, 1, above=True))
     krylov_steps: int = static_field(default=300, limits=Limits(1, 1_000_000))  # of a Newton step, at most
-    box: tuple[int, int, int] | None = static_field(default=None)  # nodes that move with matter in jit, grad and vmap
+    # nodes that move with matter in jit, grad and vmap
+    box: tuple[int, int, int] | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
     # that share the particles; None: all local ones, if it pays
     devices: int | None = static_field(default=None, limits=Limits(1, 100_000))
     # or "forward": for jvp, jacfwd and hessian

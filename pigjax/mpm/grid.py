@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import array_field, is_known, static_field
+from pigjax.core.arrays import real_field, static_field
+from pigjax.core.checks import LARGEST_WHOLE, Limits, check_fields
 from pigjax.core.errors import InputError
 
 _LONGEST = 1 << 30  # nodes of a side
@@ -26,17 +26,14 @@ class Grid(eqx.Module):
             finite.
     """
 
-    origin: Float[Array, "3"] = array_field()  # first node [m]
-    dx: Float[Array, ""] = array_field()  # [m]
-    shape: tuple[int, int, int] = static_field()
+    origin: Float[Array, "3"] = real_field()  # first node [m]
+    dx: Float[Array, ""] = real_field(limits=Limits(0, above=True, unit="m"))  # spacing of the nodes [m]
+    shape: tuple[int, int, int] = static_field(limits=Limits(1, LARGEST_WHOLE))
 
     def __check_init__(self):
+        check_fields(self)
         if min(self.shape) < 2 * WALL + 2:
             raise InputError(f"Grid.shape = {self.shape}: every side needs {2 * WALL + 2} nodes or more.")
-        if _is_concrete(self.dx) and not np.all(np.isfinite(self.dx) & (np.asarray(self.dx) > 0)):
-            raise InputError(f"Grid.dx = {self.dx}: the grid spacing must be > 0 m, and finite.")
-        if _is_concrete(self.origin) and not np.isfinite(self.origin).all():
-            raise InputError(f"Grid.origin = {self.origin}: the first node must have finite coordinates.")
 
     @property
     def points(self) -> Float[Array, "nx ny nz 3"]:
@@ -98,7 +95,3 @@ def _round_up_size(nodes: int) -> int:
     """The next of the sizes 2ᵏ and 3·2ᵏ, 8 or more."""
     sizes = (size << k for k in range(30) for size in (8, 12))
     return next(size for size in sizes if size >= nodes)
-
-
-def _is_concrete(value):
-    return isinstance(value, jax.Array) and is_known(value)  # vmap takes grids of axis numbers

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import array_field, is_known, static_field
+from pigjax.core.arrays import array_field, is_known, real_field, static_field
+from pigjax.core.checks import check_axes
 from pigjax.core.errors import InputError
 from pigjax.mpm.materials import MaterialTable
 
@@ -19,20 +20,26 @@ class Particles(eqx.Module):
     """Material points of one simulation (paper 3.1.2), in any order of materials.
 
     `x` turns NaN for a particle whose state is no longer finite; such a particle takes no further part.
+
+    Raises:
+        InputError: an array has not its axes, or is not as long as the others.
     """
 
-    x: Float[Array, "p 3"] = array_field()  # position [m]
-    v: Float[Array, "p 3"] = array_field()  # velocity [m/s]
-    F: Float[Array, "p 3 3"] = array_field()  # elastic deformation gradient
-    C: Float[Array, "p 3 3"] = array_field()  # velocity gradient, by APIC [1/s]
-    F_visual: Float[Array, "p 3 3"] = array_field()  # total deformation, for drawing
-    volume0: Float[Array, "p"] = array_field()  # at rest [m³]
-    mass: Float[Array, "p"] = array_field()  # [kg]
+    x: Float[Array, "p 3"] = real_field()  # position [m]
+    v: Float[Array, "p 3"] = real_field()  # velocity [m/s]
+    F: Float[Array, "p 3 3"] = real_field()  # elastic deformation gradient
+    C: Float[Array, "p 3 3"] = real_field()  # velocity gradient, by APIC [1/s]
+    F_visual: Float[Array, "p 3 3"] = real_field()  # total deformation, for drawing
+    volume0: Float[Array, "p"] = real_field()  # at rest [m³]
+    mass: Float[Array, "p"] = real_field()  # [kg]
     material: Int[Array, "p"] = array_field()  # row of the material table
-    hardening: Float[Array, "p"] = array_field()  # internal variable of the plastic laws
+    hardening: Float[Array, "p"] = real_field()  # internal variable of the plastic laws
     gaussian: Int[Array, "p"] = array_field()  # index of the Gaussian it carries, -1 for none
     body: Int[Array, "p"] = array_field()  # what `BodyContact` keeps apart
     counts: tuple[int, ...] = static_field()  # particles of each row, which sizes the groups by law
+
+    def __check_init__(self):
+        check_axes(self)
 
     def __len__(self) -> int:
         return self.x.shape[0]

@@ -1,9 +1,10 @@
-"""The compiled simulation: frames of substeps on one box of the grid, on one device or shared by several."""
+"""The compiled simulation: frames of substeps on one window of the grid, on one device or shared by several."""
 
 from __future__ import annotations
 
 import math
 from functools import partial
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,12 +21,12 @@ from pigjax.mpm import (
     Health,
     Particles,
     SimConfig,
+    State,
     StepHealth,
     Trajectory,
     bound_visual,
     group_by_law,
     inverse,
-    perfect_health,
     tile_order,
     to_chunks,
     to_rows,
@@ -35,206 +36,262 @@ from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.implicit.newton import balanced_velocity
 from pigjax.mpm.materials import MaterialTable
-from pigjax.mpm.substep import Scene, Setting, Watch, advance, from_grid, to_grid, touched_nodes
+from pigjax.mpm.substep import (
+    StepContext,
+    StepStatics,
+    grid_to_particles,
+    particles_to_grid,
+    substep,
+    touched_nodes,
+    update_grid,
+)
 from pigjax.mpm.transfers import KERNELS
 
 _AXIS = "particles"
 
 
-class Box(eqx.Module):
+class GridWindow(eqx.Module):
     """The nodes in use: a part of the domain."""
 
     grid: Grid
-    low: Int[Array, "3"]  # node of the domain where the box begins
+    low: Int[Array, "3"]  # node of the domain where the window begins
     domain: Int[Array, "3"]  # nodes of the domain a side
+
+
+class StepInputs(NamedTuple):
+    """The inputs of the substeps of a frame besides particles, grid and materials."""
+
+    dt: Float[Array, ""]  # of a substep [s]
+    substeps: int  # of a frame; static
+    gravity: Float[Array, "3"]  # [m/s²]
+    start: Float[Array, ""]  # time since the colliders were where their numbers say [s]
+    colliders: tuple[Collider, ...] = ()
+    contact: BodyContact | None = None  # between bodies; None: they share one velocity field
+
+    @property
+    def duration(self) -> Float[Array, ""]:
+        """Of a frame [s]."""
+        return self.dt * self.substeps
 
 
 @eqx.filter_jit
 def run_frames(
     particles: Particles,
-    box: Box,
+    window: GridWindow,
     table: MaterialTable,
     config: SimConfig,
     devices: int,
+    inputs: StepInputs,
     *,
-    dt: Float[Array, ""],
-    gravity: Float[Array, "3"],
-    colliders: tuple[Collider, ...],
-    contact: BodyContact | None,
-    start: Float[Array, ""],
     frames: int,
-    substeps: int,
     of: int | None = None,
-) -> tuple[Particles, Trajectory, Health, Bool[Array, "3 2"]]:
-    """Simulate from a time `start` [s] after the colliders were where they say; also tells the sides that were met.
+) -> tuple[Particles, Trajectory, Health, Bool[Array, "3 2"] | None]:
+    """Simulate frames of equal substeps; also returns the sides [axis, low or high] of the window that were met.
 
-    Reverse mode keeps states for a simulation of frames `of` which these are a part.
+    Args:
+        particles: at the beginning.
+        window: nodes in use.
+        table: materials.
+        config: compiled-in choices; its integrator must be decided.
+        devices: that share the particles.
+        inputs: of the substeps.
+        frames: to simulate.
+        of: frames of the whole simulation, of which these are a part: reverse mode sizes its checkpoints by it.
+            None: these are all.
+
+    Raises:
+        InputError: the integrator is "auto".
     """
     if config.integrator == "auto":
         raise InputError("SimConfig.integrator = 'auto' is undecided: take what choose_integrator finds.")
     kernel, dtype = KERNELS[config.kernel], particles.x.dtype
-    around = in_precision((box, table, dt, gravity, colliders, contact, start), dtype)
-    box, table, dt, gravity, colliders, contact, start = around
-    grid = box.grid
+    window, table, inputs = in_precision((window, table, inputs), dtype)
+    grid, contact = window.grid, inputs.contact
     grouping = group_by_law(particles, table, grid, devices, apart=contact is not None)
     states, bodies = grouping.states, 1 if contact is None else contact.bodies
     nodes = (bodies * grid.shape[0], *grid.shape[1:])
     # neighbours beside each other: in the cache, and on the same device
     orders = [tile_order(state.cells, nodes) for state in states]
-    states = tuple(_take(state, order) for state, order in zip(states, orders))
+    states = tuple(_reorder(state, order) for state, order in zip(states, orders))
     points = grid.points
     still = grouping.still
-    scene = Scene(
+    context = StepContext(
         parameters=tuple(group.parameters for group in grouping.groups),
         grid=grid,
-        low=box.low,
-        domain=box.domain,
-        dt=dt,
-        gravity=gravity,
-        colliders=colliders,
-        contacts=tuple(None if c.moves else c.contact(points) for c in colliders),
+        low=window.low,
+        domain=window.domain,
+        dt=inputs.dt,
+        gravity=inputs.gravity,
+        colliders=inputs.colliders,
+        contacts=tuple(None if c.moves else c.contact(points) for c in inputs.colliders),
         contact=contact,
         specific_volume=None if contact is None else _specific_volume(particles, contact.bodies) / grid.dx**3,
         frozen=None if still is None else touched_nodes(grid, still.x, kernel),
         unit_mass=lax.stop_gradient(jnp.where(jnp.isfinite(particles.mass), particles.mass, 0).max()),
-        go=everywhere(~(particles.volume0[0] < -jnp.finfo(dtype).max)),  # true of NaN too
+        opaque_true=everywhere(~(particles.volume0[0] < -jnp.finfo(dtype).max)),  # true of NaN too
     )
-    setting = Setting(
+    statics = StepStatics(
         kernel=kernel,
         walls=config.walls,
         laws=tuple(group.law for group in grouping.groups),
-        ruled=config.differentiation == "reverse",
-        balance=balanced_velocity if config.integrator == "implicit" else None,
+        custom_vjp=config.differentiation == "reverse",
+        solve_balance=balanced_velocity if config.integrator == "implicit" else None,
         newton_steps=config.newton_steps,
         newton_tolerance=config.newton_tolerance,
         krylov_steps=config.krylov_steps,
         axis=_AXIS if devices > 1 else None,
         fillers=sum(-len(part) % devices for part, moves in zip(grouping.parts, grouping.moves) if moves),
     )
-    nothing = Watch(perfect_health(dtype), jnp.zeros((3, 2), bool))
-    run = partial(_frames, setting, config, frames, substeps, of or frames)
+    run = partial(_frames, statics, config, frames, inputs.substeps, of or frames)
     if devices > 1:
         whole, shared = PartitionSpec(), PartitionSpec(_AXIS)
         mesh = Mesh(np.array(jax.local_devices()[:devices]), (_AXIS,))
         run = jax.shard_map(
             run,
             mesh=mesh,
-            in_specs=(whole, shared, whole, whole),
+            in_specs=(whole, shared, whole),
             out_specs=(shared, PartitionSpec(None, _AXIS), whole),
             check_vma=False,  # of loops whose carries would need marks
         )
-    states, paths, (health, met) = run(scene, states, start, nothing)
+    states, paths, (health, sides_met) = run(context, states, inputs.start)
     back = [inverse(order) for order in orders]
-    states = tuple(_take(state, order) for state, order in zip(states, back))
-    paths = tuple(_take(path, order, 1) for path, order in zip(paths, back))
-    return grouping.particles(states, grid), grouping.path(paths, grid, frames), health, met
+    states = tuple(_reorder(state, order) for state, order in zip(states, back))
+    paths = tuple(_reorder(path, order, 1) for path, order in zip(paths, back))
+    return grouping.particles(states, grid), grouping.path(paths, grid, frames), health, sides_met
 
 
-def _frames(setting, config, frames, substeps, of, scene, states, start, nothing):
-    """Frames of substeps on this device's share of the particles."""
+def _frames(
+    statics: StepStatics,
+    config: SimConfig,
+    frames: int,
+    substeps: int,
+    of: int,
+    context: StepContext,
+    states: tuple[State, ...],
+    start: Float[Array, ""],
+) -> tuple[tuple[State, ...], tuple[State, ...], tuple[Health, Bool[Array, "3 2"] | None]]:
+    """Frames of substeps on this device's share of the particles: states after them, their paths, the health."""
     counts = [len(state.cells) for state in states]
-    simple = not setting.ruled or setting.balance is not None
-    steps_of_frame = _plain_steps if simple else _rewindable_steps
+    simple = not statics.custom_vjp or statics.solve_balance is not None
+    steps_of_frame = _plain_steps if simple else _checkpointed_steps
 
     def frame(carry, _):
         states, worst, steps, stopped = carry
         chunks = tuple(to_chunks(state, config.chunk) for state in states)
-        chunks, watch = steps_of_frame(setting, substeps, of, (scene, start, nothing), chunks, steps)
+        chunks, health = steps_of_frame(statics, substeps, of, context, start, chunks, steps)
         steps = steps + substeps
         moved = tuple(
             bound_visual(to_rows(chunk, count), config.visual_stretch) for chunk, count in zip(chunks, counts)
         )
-        watch = _counted(setting, watch, moved)
-        bad = watch.health.is_bad()
+        health = _counted(statics, health, moved)
+        bad = health.is_bad()
         if config.stop:
             stopped = stopped | bad
             moved = jax.tree.map(lambda new, old: jnp.where(stopped, old, new), moved, states)
         seen = tuple(s._replace(rounded=None, C=None, stress=None, mass=None, hardening=None, row=None) for s in moved)
-        return (moved, worst.worse(watch), steps, stopped), (seen, bad)
+        return (moved, worst.combine(health), steps, stopped), (seen, bad)
 
-    carry = (states, nothing, jnp.zeros((), int), jnp.zeros((), bool))
+    perfect = StepHealth.perfect(context.dt.dtype)
+    carry = (states, perfect, jnp.zeros((), int), jnp.zeros((), bool))
     (states, worst, _, _), (paths, bad) = lax.scan(frame, carry, None, length=frames)
     first_bad = jnp.where(bad.any(), jnp.argmax(bad), -1)
-    health = Health(**vars(worst.health), substeps=jnp.asarray(substeps), first_bad_frame=first_bad)
-    return states, paths, (health, worst.met)
+    return states, paths, (worst.of_rollout(substeps, first_bad), worst.sides_met)
 
 
-def _rewindable_steps(setting, substeps, frames, shared, states, first):
-    """Steps of a frame with the reverse-mode rule of `rewind`.
+def _checkpointed_steps(
+    statics: StepStatics,
+    substeps: int,
+    frames: int,
+    context: StepContext,
+    start: Float[Array, ""],
+    states: tuple[State, ...],
+    first: Int[Array, ""],
+) -> tuple[tuple[State, ...], StepHealth]:
+    """Steps of a frame with the reverse-mode rule of `adjoint`.
 
-    `first` is the number of the first one, `frames` how many the whole simulation has.
+    `first` is the number of the first one, `frames` the number of frames of the whole simulation.
     """
 
     def begin(shared, states):
-        return to_grid(setting, shared[0], states)
+        return particles_to_grid(statics, shared[0], states)
 
     def end(shared, states, nodes, number):
-        scene, start, nothing = shared
-        return from_grid(setting, scene, states, nodes, start + number * scene.dt, nothing)
+        context, start = shared
+        velocity, converged = update_grid(statics, context, states, nodes, start + number * context.dt)
+        return grid_to_particles(statics, context, states, velocity, converged)
 
     fixed = [{name for name in _FIXED if getattr(state, name) is not None} for state in states]
     passive = tuple(
         jax.tree.map(lambda _: False, state)._replace(**dict.fromkeys(names, True))
         for state, names in zip(states, fixed)
     )
-    # Fewest states are held where blocks have the root of all steps. Of a single frame the last block is not computed
-    # anew, so that longer ones save time.
+    # Memory is least where blocks have the root of all steps. Of a single frame the last block is not recomputed, so
+    # that longer ones save time.
     most = math.isqrt((2 if frames == 1 else 1) * frames * substeps)
     block = -(-substeps // -(-substeps // most))
-    steps = Steps(begin, end, substeps, block, keep=frames == 1, passive=passive)
-    after, watch = run_steps(steps, shared, states, first, shared[-1])
+    perfect = partial(StepHealth.perfect, context.dt.dtype)
+    steps = Steps(begin, end, perfect, substeps, block, keep=frames == 1, passive=passive)
+    after, health = run_steps(steps, (context, start), states, first)
     return tuple(
         new._replace(**{name: jnp.where(new.volume > 0, getattr(old, name), 0) for name in names})
         for old, new, names in zip(states, after, fixed)
-    ), watch
+    ), health
 
 
 _FIXED = ("mass", "volume", "row")  # no step changes them, but to zero where a particle is no longer finite
 
 
-def _plain_steps(setting, substeps, frames, shared, states, first):
-    """The same for forward mode, and for implicit steps, none of which a reverse-mode rule should solve again."""
-    scene, start, nothing = shared
+def _plain_steps(
+    statics: StepStatics,
+    substeps: int,
+    frames: int,
+    context: StepContext,
+    start: Float[Array, ""],
+    states: tuple[State, ...],
+    first: Int[Array, ""],
+) -> tuple[tuple[State, ...], StepHealth]:
+    """The same for forward mode, and for implicit steps, whose solves a reverse-mode rule should not repeat."""
 
-    def substep(carry, _):
-        states, watch, number = carry
-        states, own = advance(setting, scene, states, start + number * scene.dt, nothing)
-        return (states, watch.worse(own), number + 1), None
+    def step(carry, _):
+        states, health, number = carry
+        states, own = substep(statics, context, states, start + number * context.dt)
+        return (states, health.combine(own), number + 1), None
 
     most = math.isqrt(frames * substeps)
     block = next(n for n in range(min(substeps, most), 0, -1) if substeps % n == 0)
 
     @partial(jax.checkpoint, prevent_cse=False)
     def steps_of_block(carry, _):
-        return lax.scan(substep, carry, None, length=block)
+        return lax.scan(step, carry, None, length=block)
 
-    (states, watch, _), _ = lax.scan(steps_of_block, (states, nothing, first), None, length=substeps // block)
-    return states, watch
+    carry = states, StepHealth.perfect(context.dt.dtype), first
+    (states, health, _), _ = lax.scan(steps_of_block, carry, None, length=substeps // block)
+    return states, health
 
 
-def _counted(setting, watch, states):
+def _counted(statics: StepStatics, health: StepHealth, states: tuple[State, ...]) -> StepHealth:
     """The health of all devices, with the particles that are not finite."""
-    watch, states = jax.tree.map(lax.stop_gradient, (watch, states))
-    health = watch.health
+    health, states = jax.tree.map(lax.stop_gradient, (health, states))
     gone = sum((state.volume <= 0).sum() for state in states)
     counts = jnp.stack([health.escaped, health.inverted, health.wall_hits, gone])
-    least, most, met = health.min_J, health.max_courant, watch.met
-    if setting.axis is not None:
-        counts = lax.psum(counts, setting.axis)
-        least, most = lax.pmin(least, setting.axis), lax.pmax(most, setting.axis)
-        met = lax.pmax(met.astype(int), setting.axis) > 0
+    least, most, met = health.min_J, health.max_courant, health.sides_met
+    assert met is not None
+    if statics.axis is not None:
+        counts = lax.psum(counts, statics.axis)
+        least, most = lax.pmin(least, statics.axis), lax.pmax(most, statics.axis)
+        met = lax.pmax(met.astype(int), statics.axis) > 0
     escaped, inverted, wall_hits, gone = counts
-    nonfinite = gone - setting.fillers
-    health = StepHealth(least, most, escaped, nonfinite, inverted, health.unconverged, wall_hits)
-    return Watch(health, met)
+    nonfinite = gone - statics.fillers
+    return StepHealth(least, most, escaped, nonfinite, inverted, health.unconverged, wall_hits, sides_met=met)
 
 
-def _specific_volume(particles, bodies):
+def _specific_volume(particles: Particles, bodies: int) -> Float[Array, "b"]:
+    """Of each body, on average [m³/kg]."""
     volume, mass = (
         jax.ops.segment_sum(values, particles.body, bodies) for values in (particles.volume0, particles.mass)
     )
     return volume / jnp.where(mass > 0, mass, 1.0)
 
 
-def _take(state, order, axis=0):
+def _reorder(state: Any, order: Int[Array, "p"], axis: int = 0) -> Any:
     return jax.tree.map(lambda rows: jnp.take(rows, order, axis), state)

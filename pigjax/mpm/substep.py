@@ -1,12 +1,16 @@
-"""One explicit substep of MLS-MPM with APIC on particles in chunks: to the grid, grid update, back to the particles."""
+"""One substep of MLS-MPM with APIC: `particles_to_grid` (P2G), `update_grid`, `grid_to_particles` (G2P).
+
+The same three functions serve forward simulation and the adjoint, which keeps the grid between the first and the
+second. `reference.py` is the plain twin, with the same names and without chunks or devices.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,58 +19,61 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.mpm import WALL, Grid, State, StepHealth
 from pigjax.mpm.by_law import by_component, by_row
-from pigjax.mpm.chunked import Pass, gather_chunks, scatter_chunks
-from pigjax.mpm.colliders import Collider, Contact, Press
+from pigjax.mpm.chunked import ChunkLoop, gather_chunks, scatter_chunks
+from pigjax.mpm.colliders import Collider, Contact, Press, Time
 from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.health import LaneHealth
 from pigjax.mpm.materials import Parameters, respond
 from pigjax.mpm.materials.tensors import determinant, product
 from pigjax.mpm.transfers import (
     CHANNELS,
     Kernel,
-    apic,
-    brought,
-    collect,
+    Stencil,
+    Windows,
+    affine_momentum,
     first_nodes,
-    ruled_collect,
-    ruled_spread,
-    spread,
-    stage,
+    gather_window,
+    gather_window_vjp,
+    no_fuse,
+    scatter_window,
+    scatter_window_vjp,
+    velocity_and_gradient,
 )
 
-_STILL = 1e-5  # displacement of a step that is none: what rounding moves [cells]
+_STILL = 1e-5  # displacement of one step that counts as none: rounding [cells]
 
 
-class Setting(NamedTuple):
-    """What is compiled in."""
+class StepStatics(NamedTuple):
+    """The choices of a step that are compiled in."""
 
     kernel: Kernel
     walls: str | None
-    laws: tuple[str, ...]  # that move
-    ruled: bool  # reverse mode by the rules of `passes`
-    balance: Callable | None  # the implicit integrator, which finds the velocities that stresses balance
+    laws: tuple[str, ...]  # of the groups, which move
+    custom_vjp: bool  # whether reverse mode follows the rules of `transfers`, `chunked` and `adjoint`
+    solve_balance: Callable | None  # the implicit integrator: node velocities in balance with the stresses they cause
     newton_steps: int
     newton_tolerance: float
     krylov_steps: int
-    axis: str | None  # over which devices share the particles
+    axis: str | None  # name of the devices that share the particles
     fillers: int  # particles without mass that even out the devices' shares
 
 
-class Scene(NamedTuple):
-    """What all steps of a simulation share."""
+class StepContext(NamedTuple):
+    """The arrays that all steps of a simulation share."""
 
     parameters: tuple[Parameters, ...]  # of each law
-    grid: Grid  # the box of nodes in use
-    low: Int[Array, "3"]  # node of the domain where the box begins
+    grid: Grid  # the window of nodes in use
+    low: Int[Array, "3"]  # node of the domain where the window begins
     domain: Int[Array, "3"]  # nodes of the domain a side
-    dt: Float[Array, ""]
-    gravity: Float[Array, "3"]
+    dt: Float[Array, ""]  # [s]
+    gravity: Float[Array, "3"]  # [m/s²]
     colliders: tuple[Collider, ...]
     contacts: tuple[Contact | None, ...]  # of the colliders that do not move
     contact: BodyContact | None  # between bodies, each of which has a grid of its own beside the others
     specific_volume: Float[Array, "b"] | None  # of each body, on average [cells/kg]
     frozen: Bool[Array, "nx ny nz"] | None  # nodes that stationary matter touches
     unit_mass: Float[Array, ""]  # of the heaviest particle [kg]
-    go: Bool[Array, ""]  # for `transfers.stage`
+    opaque_true: Bool[Array, ""]  # for `transfers.no_fuse`
 
     @property
     def bodies(self) -> int:
@@ -80,197 +87,189 @@ class Scene(NamedTuple):
         return self.bodies * nx, ny, nz
 
 
-class Watch(eqx.Module):
-    """Health of a step, and whether the box was large enough."""
-
-    health: StepHealth
-    met: Bool[Array, "3 2"]  # sides of the box that held a particle back
-
-    def worse(self, other: Watch) -> Watch:
-        """The worse of two, number by number."""
-        return Watch(self.health.worse(other.health), self.met | other.met)
-
-    def beside(self, other: Watch) -> Watch:
-        """Of two groups in the same step: the worse of both, and counts add up."""
-
-        def counts(watch):
-            return watch.health.escaped, watch.health.inverted, watch.health.wall_hits
-
-        return eqx.tree_at(counts, self.worse(other), tuple(map(sum, zip(counts(self), counts(other)))))
+def substep(
+    statics: StepStatics, context: StepContext, states: tuple[State, ...], time: Time
+) -> tuple[tuple[State, ...], StepHealth]:
+    """One step of all groups of particles, begun at a time [s]; returns their states and the health of the step."""
+    nodes = particles_to_grid(statics, context, states)
+    velocity, converged = update_grid(statics, context, states, nodes, time)
+    return grid_to_particles(statics, context, states, velocity, converged)
 
 
-class Tally(NamedTuple):
-    """Health of a step, lane by lane of the chunks: XLA:CPU runs each sum over a chunk as an operation of its own."""
+def particles_to_grid(statics: StepStatics, context: StepContext, states: tuple[State, ...]) -> Float[Array, "x y z 4"]:
+    """P2G: mass [kg] and momentum [kg m/s] of the nodes; in explicit steps with the impulse of the present stress.
 
-    min_J: Float[Array, "c"]
-    speed_squared: Float[Array, "c"]  # the largest
-    out: Bool[Array, "3 2 c"]  # past a side of the box
-    escaped: Int[Array, "c"]
-    inverted: Int[Array, "c"]
-    wall_hits: Int[Array, "c"] | None  # None: they are not counted
-
-    def joined(self, other: Tally) -> Tally:
-        """Of both chunks; counts add up."""
-        return Tally(
-            jnp.minimum(self.min_J, other.min_J),
-            jnp.maximum(self.speed_squared, other.speed_squared),
-            self.out | other.out,
-            self.escaped + other.escaped,
-            self.inverted + other.inverted,
-            None if self.wall_hits is None or other.wall_hits is None else self.wall_hits + other.wall_hits,
-        )
-
-    def watch(self, cells_per_speed: Float[Array, ""]) -> Watch:
-        """What it says of the step; `cells_per_speed` [cells s/m] is the way of a step at 1 m/s."""
-        health = StepHealth(
-            min_J=self.min_J.min(),
-            max_courant=jnp.sqrt(self.speed_squared.max()) * cells_per_speed,
-            escaped=self.escaped.sum(),
-            nonfinite=jnp.zeros((), int),
-            inverted=self.inverted.sum(),
-            unconverged=jnp.zeros((), int),
-            wall_hits=jnp.zeros((), int) if self.wall_hits is None else self.wall_hits.sum(),
-        )
-        return Watch(health, self.out.any(2))
-
-
-def _no_tally(like: Float[Array, "_ c"], counts_walls: bool) -> Tally:
-    lanes, zero = like.shape[-1], jnp.zeros_like(like[0])
-    count = jnp.zeros(lanes, int)
-    return Tally(zero + jnp.inf, zero, jnp.zeros((3, 2, lanes), bool), count, count, count if counts_walls else None)
-
-
-def advance(
-    setting: Setting, scene: Scene, states: tuple[State, ...], time: Array, nothing: Watch
-) -> tuple[tuple[State, ...], Watch]:
-    """One step of all groups."""
-    return from_grid(setting, scene, states, to_grid(setting, scene, states), time, nothing)
-
-
-def to_grid(setting: Setting, scene: Scene, states: tuple[State, ...]) -> Float[Array, "x y z 4"]:
-    """First half of a step: mass and momentum of the nodes, with the impulse of the present stress in explicit steps.
-
-    Stages of a step bear names in a profile.
+    mᵢ = Σ wᵢₚ mₚ and (m v)ᵢ = Σ wᵢₚ (mₚ vₚ + (mₚ Cₚ − Δt Vₚ τₚ D⁻¹) (xᵢ − xₚ)) (Hu et al. 2018, eq. 29).
     """
-    with jax.named_scope("to_grid"):
-        give = Pass(partial(_give, setting), setting.kernel, scene.nodes)
-        shared = (scene.dt, scene.grid.dx)
-        total = jnp.zeros((*scene.nodes, CHANNELS), scene.dt.dtype)
+    with jax.named_scope("particles_to_grid"):
+        loop = ChunkLoop(partial(_scatter_chunk, statics), statics.kernel, context.nodes)
+        shared = (context.dt, context.grid.dx)
+        total = jnp.zeros((*context.nodes, CHANNELS), context.dt.dtype)
         for state in states:
-            given = (state.v, state.C, state.stress, state.mass, state.volume)
-            total = total + scatter_chunks(give, scene.go, state.cells, given, shared, ruled=setting.ruled)
-        return total if setting.axis is None else lax.psum(total, setting.axis)
+            chunks = (state.v, state.C, state.stress, state.mass, state.volume)
+            total = total + scatter_chunks(
+                loop, context.opaque_true, state.cells, chunks, shared, custom_vjp=statics.custom_vjp
+            )
+        return total if statics.axis is None else lax.psum(total, statics.axis)
 
 
-def from_grid(
-    setting: Setting,
-    scene: Scene,
+def update_grid(
+    statics: StepStatics,
+    context: StepContext,
     states: tuple[State, ...],
     nodes: Float[Array, "x y z 4"],
-    time: Array,
-    nothing: Watch,
-) -> tuple[tuple[State, ...], Watch]:
-    """Second half of a step, begun at a time [s]: the grid's update, and back to the particles."""
-    with jax.named_scope("on_grid"):
-        velocity, converged = _on_grid(setting, scene, states, nodes, time)
-    watch, moved = eqx.tree_at(lambda w: w.health.unconverged, nothing, jnp.asarray(converged) ^ True), []
-    inner = _between_walls(setting, scene) if setting.walls is None else None
-    for law, parameters, state in zip(setting.laws, scene.parameters, states):
-        take = Pass(partial(_take, setting, scene.nodes, scene.bodies, law), setting.kernel, scene.nodes)
-        shared = (scene.dt, scene.grid.dx, parameters, inner)
-        with jax.named_scope("from_grid"):
-            none = _no_tally(state.cells[0], inner is not None)
-            state, tally = gather_chunks(take, scene.go, velocity, state, shared, none, ruled=setting.ruled)
+    time: Time,
+) -> tuple[Float[Array, "x y z 3"], Bool[Array, ""] | bool]:
+    """Grid update: node velocities [m/s] after gravity, contact, colliders and walls; whether they were found.
+
+    vᵢ = (m v)ᵢ / mᵢ + Δt g, then the boundary conditions. Implicit steps solve for velocities in balance with the
+    stresses that they cause (`implicit.newton`), and may miss the tolerance.
+    """
+    with jax.named_scope("update_grid"):
+        if statics.solve_balance is not None:
+            return statics.solve_balance(statics, context, states, nodes, time)
+        _, velocity = free_velocity(context, nodes)
+        if context.contact is not None:
+            velocity = _separate_bodies(statics, context, states, nodes, velocity)
+        return apply_boundaries(statics, context, velocity, time=time), True
+
+
+def grid_to_particles(
+    statics: StepStatics,
+    context: StepContext,
+    states: tuple[State, ...],
+    velocity: Float[Array, "x y z 3"],
+    converged: Bool[Array, ""] | bool,
+) -> tuple[tuple[State, ...], StepHealth]:
+    """G2P: the particles' velocities, affine momentum, positions and deformation after the step, and its health.
+
+    vₚ = Σ wᵢₚ vᵢ, Cₚ = D⁻¹ Σ wᵢₚ vᵢ (xᵢ − xₚ)ᵀ, xₚ += Δt vₚ, and the law's F from (I + Δt Cₚ) F.
+    """
+    inner = _between_walls(statics, context) if statics.walls is None else None
+    health, moved = StepHealth.perfect(context.dt.dtype), []
+    for law, parameters, state in zip(statics.laws, context.parameters, states):
+        function = partial(_gather_chunk, statics, context.nodes, context.bodies, law)
+        loop = ChunkLoop(function, statics.kernel, context.nodes, counts_walls=inner is not None)
+        shared = (context.dt, context.grid.dx, parameters, inner)
+        with jax.named_scope("grid_to_particles"):
+            state, lanes = gather_chunks(
+                loop, context.opaque_true, velocity, state, shared, custom_vjp=statics.custom_vjp
+            )
         moved.append(state)
-        watch = watch.beside(lax.stop_gradient(tally.watch(scene.dt / scene.grid.dx)))
-    return tuple(moved), watch
+        own = lax.stop_gradient(lanes.of_step(context.dt / context.grid.dx))
+        health = health.combine(own, counts=jnp.add)
+    return tuple(moved), replace(health, unconverged=1 - jnp.asarray(converged).astype(int))
 
 
-def _on_grid(setting, scene, states, nodes, time):
-    """Velocities of the nodes after the step, and whether they were found."""
-    if setting.balance is not None:
-        return setting.balance(setting, scene, states, nodes, time)
-    limit = partial(boundaries, setting, scene, time=time)
-    if scene.contact is not None:
-        _, velocity = free_velocity(scene, nodes)
-        return limit(_part_bodies(setting, scene, states, nodes, velocity)), True
-    return limit(free_velocity(scene, nodes)[1]), True
-
-
-def _give(setting, go, at, chunk, shared):
+def _scatter_chunk(
+    statics: StepStatics, opaque_true: Bool[Array, ""], at: Stencil, chunk: tuple[Array, ...], shared: tuple[Array, ...]
+) -> Windows:
     """Windows of a chunk."""
     dt, dx = shared
 
-    def bring(distance, v, C, stress, mass, volume):
+    def momentum(distance, v, C, stress, mass, volume):
         affine = dx * mass * C
-        if setting.balance is None:
-            affine = affine - (dt * setting.kernel.inverse_inertia / dx) * volume * stress
-        return brought(distance, mass[0], v, affine)
+        if statics.solve_balance is None:
+            affine = affine - (dt * statics.kernel.inverse_inertia / dx) * volume * stress
+        return affine_momentum(distance, mass[0], v, affine)
 
-    transfer = ruled_spread if setting.ruled else spread
+    scatter = scatter_window_vjp if statics.custom_vjp else scatter_window
     v, C, stress, *others = chunk
-    polynomial = stage(go, bring, at.distance, v, by_component(C), by_component(stress), *others)
-    return transfer(setting.kernel, go, at, polynomial)
+    polynomial = no_fuse(opaque_true, momentum, at.distance, v, by_component(C), by_component(stress), *others)
+    return scatter(statics.kernel, opaque_true, at, polynomial)
 
 
-def _take(setting, shape, bodies, law, go, at, windows, state, shared):
-    """A chunk after the step, and its tally."""
+def _gather_chunk(
+    statics: StepStatics,
+    shape: tuple[int, int, int],
+    bodies: int,
+    law: str,
+    opaque_true: Bool[Array, ""],
+    at: Stencil,
+    windows: Windows,
+    state: State,
+    shared: Any,
+) -> tuple[State, LaneHealth]:
+    """A chunk after the step, and its health."""
     dt, dx, parameters, inner = shared
-    transfer = ruled_collect if setting.ruled else collect
-    moments = transfer(setting.kernel, go, at, windows)
-    v, per_cell = stage(go, partial(apic, setting.kernel), at.distance, moments)
+    gather = gather_window_vjp if statics.custom_vjp else gather_window
+    moments = gather(statics.kernel, opaque_true, at, windows)
+    v, per_cell = no_fuse(opaque_true, partial(velocity_and_gradient, statics.kernel), at.distance, moments)
     with jax.named_scope("law"):
-        new = in_rows(stage(go, partial(_respond, law), by_components(state), v, per_cell, dt, dx, parameters))
-    return _settle(shape, bodies, go, new, state, inner)
+        arguments = by_components(state), v, per_cell, dt, dx, parameters
+        new = in_rows(no_fuse(opaque_true, partial(_respond, law), *arguments))
+    return _settle(shape, bodies, opaque_true, new, state, inner)
 
 
-def _settle(shape, bodies, go, new, state, inner):
-    """A chunk held in the grid, without what is not finite, and its tally."""
+def _settle(
+    shape: tuple[int, int, int],
+    bodies: int,
+    opaque_true: Bool[Array, ""],
+    new: State,
+    state: State,
+    inner: Float[Array, "3 2"] | None,
+) -> tuple[State, LaneHealth]:
+    """A chunk held in the grid, without the particles that are not finite, and its health."""
     with jax.named_scope("health"):
-        ok, held, tally = stage(go, partial(_check, shape, bodies), new, state.cells, state.volume, inner)
-        return _only_finite(ok, new._replace(cells=held), shape), tally
+        check = partial(_check, shape, bodies)
+        ok, held, health = no_fuse(opaque_true, check, new, state.cells, state.volume, inner)
+        return _only_finite(ok, new._replace(cells=held), shape), health
 
 
-def _between_walls(setting, scene):
-    """Lowest and highest cells [3 2] of particles whose kernel touches no node of the domain's walls."""
-    reach = len(setting.kernel.offsets) / 2
-    ends = jnp.stack([WALL - 1 + reach - scene.low, scene.domain - WALL - reach - scene.low], 1)
-    return lax.stop_gradient(ends.astype(scene.dt.dtype))
+def _between_walls(statics: StepStatics, context: StepContext) -> Float[Array, "3 2"]:
+    """Lowest and highest cells of particles whose kernel touches no node of the domain's walls."""
+    reach = len(statics.kernel.offsets) / 2
+    ends = jnp.stack([WALL - 1 + reach - context.low, context.domain - WALL - reach - context.low], 1)
+    return lax.stop_gradient(ends.astype(context.dt.dtype))
 
 
-def _check(shape, bodies, state, before, volume, inner):
+def _check(
+    shape: tuple[int, int, int],
+    bodies: int,
+    state: State,
+    before: Float[Array, "3 c"],
+    volume: Float[Array, "1 c"],
+    inner: Float[Array, "3 2"] | None,
+) -> tuple[Bool[Array, "c"], Float[Array, "3 c"], LaneHealth]:
     """Which particles are finite, the cells that the grid holds them in, and the health."""
     low, high = np.ones((3, 1)), np.array(shape)[:, None] / np.array([[bodies], [1], [1]]) - 2.0
     low, high = low.astype(before.dtype), high.astype(before.dtype)
+    start: Array | float = 0.0
     if bodies > 1:
         width = shape[0] // bodies
         start = jnp.floor(before[:1] / width) * width * np.eye(3, 1, dtype=before.dtype)
         low, high = low + start, high + start
-    else:
-        start = 0.0
     held = jnp.clip(state.cells, low, high)
     J, speed_squared = determinant(by_component(state.F)), (state.v**2).sum(0)
-    alive = (volume[0] > 0) & ~jnp.isnan(J) & ~jnp.isnan(speed_squared)  # what is not is counted as such
+    alive = (volume[0] > 0) & ~jnp.isnan(J) & ~jnp.isnan(speed_squared)  # `nonfinite` counts the others
     out = jnp.stack([state.cells < held, state.cells > held], 1) & alive
-    tally = Tally(
+    health = LaneHealth(
         min_J=jnp.where(alive, J, jnp.inf),
         speed_squared=jnp.where(alive, speed_squared, 0.0),
-        out=out,
+        sides_met=out,
         escaped=out.any((0, 1)).astype(int),
         inverted=(alive & (J <= 0)).astype(int),
         wall_hits=None if inner is None else (alive & _hits(state.cells - start, before - start, inner)).astype(int),
     )
     ok = jnp.isfinite(sum(rows.sum(0) for rows in jax.tree.leaves(state._replace(cells=held))))
-    return ok, held, jax.tree.map(lax.stop_gradient, tally)
+    return ok, held, jax.tree.map(lax.stop_gradient, health)
 
 
-def _hits(cells, before, inner):
+def _hits(cells: Float[Array, "3 c"], before: Float[Array, "3 c"], inner: Float[Array, "3 2"]) -> Bool[Array, "c"]:
     """Which particles have moved towards a wall that their kernel touches."""
     low, high = inner[:, :1], inner[:, 1:]
     return (((cells < low) & (cells < before - _STILL)) | ((cells > high) & (cells > before + _STILL))).any(0)
 
 
-def _respond(law, state, v, per_cell, dt, dx, parameters):
+def _respond(
+    law: str,
+    state: State,
+    v: Float[Array, "3 c"],
+    per_cell: Float[Array, "3 3 c"],
+    dt: Float[Array, ""],
+    dx: Float[Array, ""],
+    parameters: Parameters,
+) -> State:
     """State after the particles moved and their matter responded; tensors [3 3 c]."""
     rate = per_cell / dx
     if state.row is not None:
@@ -280,11 +279,11 @@ def _respond(law, state, v, per_cell, dt, dx, parameters):
     visual = state.visual
     if visual is not None:
         visual = visual + dt * product(rate, visual)
-    way = dt / dx * v - state.rounded
-    cells = state.cells + way
+    displacement = dt / dx * v - state.rounded
+    cells = state.cells + displacement
     return state._replace(
         cells=cells,
-        rounded=lax.stop_gradient((cells - state.cells) - way),
+        rounded=lax.stop_gradient((cells - state.cells) - displacement),
         v=v,
         C=rate,
         F=F,
@@ -295,7 +294,7 @@ def _respond(law, state, v, per_cell, dt, dx, parameters):
 
 
 def by_components(state: State) -> State:
-    """A state with its tensors as [3 3 c]; outside of a stage, where XLA:CPU would visit them number by number."""
+    """A state with its tensors as [3 3 c]; outside of `no_fuse`, where XLA:CPU would visit them number by number."""
     return _reshaped(state, by_component)
 
 
@@ -304,18 +303,18 @@ def in_rows(state: State) -> State:
     return _reshaped(state, by_row)
 
 
-def _reshaped(state, how):
+def _reshaped(state: State, how: Callable[[Array], Array]) -> State:
     tensors = {"C": state.C, "F": state.F, "stress": state.stress, "visual": state.visual}
     return state._replace(**{name: how(tensor) for name, tensor in tensors.items() if tensor is not None})
 
 
-def parameters_of(parameters, row):
+def parameters_of(parameters: Parameters, row: Float[Array, "c"]) -> Parameters:
     """Parameters of each particle [c] from those of each material [m]; a sum whose transpose needs no scatter."""
     count = len(jax.tree.leaves(parameters)[0])
     return jax.tree.map(lambda p: sum(jnp.where(row == k, p[k], 0) for k in range(count)), parameters)
 
 
-def _only_finite(ok, state, shape):
+def _only_finite(ok: Bool[Array, "c"], state: State, shape: tuple[int, int, int]) -> State:
     """Particles that are not `ok` are put at rest in the middle of the grid, without mass."""
     rest = jax.tree.map(jnp.zeros_like, state)._replace(
         cells=jnp.broadcast_to((np.array(shape)[:, None] / 2).astype(state.cells.dtype), state.cells.shape),
@@ -325,68 +324,84 @@ def _only_finite(ok, state, shape):
 
 
 def free_velocity(
-    scene: Scene, nodes: Float[Array, "n y z 4"]
+    context: StepContext, nodes: Float[Array, "n y z 4"]
 ) -> tuple[Bool[Array, "*b x y z 1"], Float[Array, "*b x y z 3"]]:
-    """Which nodes have mass, and their velocities [m/s] under gravity, with nothing in the way."""
-    if scene.contact is not None:
-        nodes = nodes.reshape(scene.bodies, *scene.grid.shape, 4)
-    mass = nodes[..., :1] / scene.unit_mass
+    """Which nodes have mass, and their velocities [m/s] under gravity, before any contact."""
+    if context.contact is not None:
+        nodes = nodes.reshape(context.bodies, *context.grid.shape, 4)
+    mass = nodes[..., :1] / context.unit_mass
     # Below this a node's mass squared, by which derivatives divide, leaves the range of floating point.
     filled = mass > jnp.finfo(mass.dtype).tiny ** 0.5
-    velocity = nodes[..., 1:] / scene.unit_mass / jnp.where(filled, mass, 1.0) + scene.dt * scene.gravity
+    velocity = nodes[..., 1:] / context.unit_mass / jnp.where(filled, mass, 1.0) + context.dt * context.gravity
     return filled, jnp.where(filled, velocity, 0.0)
 
 
-def _part_bodies(setting, scene, states, nodes, velocity):
-    """Velocities [b x y z 3] after bodies met. Where their matter is goes to the grid as momentum would."""
-    width = scene.grid.shape[0]
+def _separate_bodies(
+    statics: StepStatics,
+    context: StepContext,
+    states: tuple[State, ...],
+    nodes: Float[Array, "n y z 4"],
+    velocity: Float[Array, "b x y z 3"],
+) -> Float[Array, "b x y z 3"]:
+    """Velocities after contact between bodies. P2G brings the place of their matter to the grid as it does momentum."""
+    assert context.contact is not None
+    assert context.specific_volume is not None
+    width = context.grid.shape[0]
 
     def moments(state):
         along = jnp.array([1, 0, 0], state.cells.dtype)[:, None]
         place = state.cells - jnp.floor(state.cells[:, :1] / width) * width * along
         return state._replace(v=place, C=0 * state.C, stress=0 * state.stress)
 
-    moment = to_grid(setting, scene, tuple(map(moments, states)))
-    apart = (scene.bodies, *scene.grid.shape, 4)
+    moment = particles_to_grid(statics, context, tuple(map(moments, states)))
+    apart = (context.bodies, *context.grid.shape, 4)
     mass = nodes.reshape(apart)[..., :1]
-    specific = scene.specific_volume[:, None, None, None, None]
-    return scene.contact.part(
-        velocity, mass / scene.unit_mass, specific * mass, specific * moment.reshape(apart)[..., 1:]
+    specific = context.specific_volume[:, None, None, None, None]
+    return context.contact.part(
+        velocity, mass / context.unit_mass, specific * mass, specific * moment.reshape(apart)[..., 1:]
     )
 
 
-def boundaries(
-    setting: Setting,
-    scene: Scene,
+def apply_boundaries(
+    statics: StepStatics,
+    context: StepContext,
     velocity: Float[Array, "*b x y z 3"],
     *,
-    time: Array,
+    time: Time,
     press: Sequence[Press] | None = None,
 ) -> Float[Array, "n y z 3"]:
-    """Velocities of the nodes after colliders, stationary matter and the walls of the domain.
+    """Velocities of the nodes [m/s] after colliders, stationary matter and the walls of the domain.
 
-    With `press`, friction goes by how nodes are said to press against each collider.
+    Args:
+        statics: the walls' mode.
+        context: colliders, nodes that stationary matter touches, and the window of the domain.
+        velocity: of the nodes, of each body if there are several [m/s].
+        time: since the colliders were where their numbers say [s].
+        press: how nodes press against each collider, if friction must follow that; None: by their velocity.
     """
-    for k, (collider, contact) in enumerate(zip(scene.colliders, scene.contacts)):
-        contact = collider.contact(scene.grid.points, time) if contact is None else contact
+    for k, (collider, contact) in enumerate(zip(context.colliders, context.contacts)):
+        contact = collider.contact(context.grid.points, time) if contact is None else contact
         velocity = collider.apply(contact, velocity, None if press is None else press[k])
-    if scene.frozen is not None:
-        velocity = jnp.where(scene.frozen[..., None], 0.0, velocity)
-    return _apply_walls(velocity, setting.walls, scene).reshape(*scene.nodes, 3)
+    if context.frozen is not None:
+        velocity = jnp.where(context.frozen[..., None], 0.0, velocity)
+    return apply_walls(velocity, statics.walls, context.low, context.domain).reshape(*context.nodes, 3)
 
 
-def _apply_walls(velocity, mode, scene):
+def apply_walls(
+    velocity: Float[Array, "*b x y z 3"], mode: str | None, low: Int[Array, "3"], domain: Int[Array, "3"]
+) -> Float[Array, "*b x y z 3"]:
+    """Velocities of the nodes after the walls of the domain, of which the window begins at node `low`."""
     components = [velocity[..., k] for k in range(3)]
     for axis, nodes in enumerate(velocity.shape[-4:-1]):
-        index = (jnp.arange(nodes) + scene.low[axis]).reshape([-1 if k == axis else 1 for k in range(3)])
-        low, high = index < WALL, index >= scene.domain[axis] - WALL
+        index = (jnp.arange(nodes) + low[axis]).reshape([-1 if k == axis else 1 for k in range(3)])
+        lower, upper = index < WALL, index >= domain[axis] - WALL
         if mode == "sticky":
-            components = [jnp.where(low | high, 0.0, v) for v in components]
+            components = [jnp.where(lower | upper, 0.0, v) for v in components]
         elif mode == "slip":
-            components[axis] = jnp.where(low | high, 0.0, components[axis])
+            components[axis] = jnp.where(lower | upper, 0.0, components[axis])
         else:
             v = components[axis]
-            components[axis] = jnp.where(low, jnp.maximum(v, 0.0), jnp.where(high, jnp.minimum(v, 0.0), v))
+            components[axis] = jnp.where(lower, jnp.maximum(v, 0.0), jnp.where(upper, jnp.minimum(v, 0.0), v))
     return jnp.stack(components, -1)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -55,17 +55,39 @@ def stable_dt(
 
 @checked
 def choose_integrator(
-    particles: Particles, grid: Grid, table: MaterialTable, config: SimConfig, **steps: Any
+    particles: Particles,
+    grid: Grid,
+    table: MaterialTable,
+    config: SimConfig,
+    *,
+    frames: int,
+    frame_dt: Float[Array, ""] | float,
+    gravity: Vector,
+    colliders: tuple[Collider, ...] = (),
 ) -> SimConfig:
-    """The settings with integrator "auto" decided (host): implicit where it saves more steps than one of its costs.
+    """The configuration with its integrator "auto" decided (host): the one with the lower cost.
 
-    `steps` are the other arguments of `choose_substeps`.
+    An implicit step costs about as much as 400 explicit ones. The other arguments are those of `choose_substeps`.
+
+    Raises:
+        InputError: a number is out of range, or no step is stable.
     """
     if config.integrator != "auto":
         return config
-    explicit, implicit = (replace(config, integrator=name) for name in ("explicit", "implicit"))
-    needed = [choose_substeps(particles, grid, table, choice, **steps) for choice in (explicit, implicit)]
-    return implicit if needed[0] > _COST_OF_IMPLICIT * needed[1] else explicit
+    explicit, implicit = (
+        choose_substeps(
+            particles,
+            grid,
+            table,
+            replace(config, integrator=integrator),
+            frames=frames,
+            frame_dt=frame_dt,
+            gravity=gravity,
+            colliders=colliders,
+        )
+        for integrator in ("explicit", "implicit")
+    )
+    return replace(config, integrator="implicit" if explicit > _COST_OF_IMPLICIT * implicit else "explicit")
 
 
 @checked
@@ -84,15 +106,15 @@ def choose_substeps(
 
     The speed that falling can reach, by time or by the size of the grid, counts beside the present one. The number is
     rounded up by at most an eighth, so that similar scenes share one compilation. It serves every frame of a rollout;
-    in a domain without walls (`vast_grid`) `rollout` begins with fewer, see `first_substeps`.
+    in a domain without walls (`vast_grid`) `rollout` begins with fewer, see `substep_rule`.
 
     Raises:
         InputError: a number is out of range, or no step is stable.
     """
     check_steps(frames, frame_dt, gravity)
-    if config.integrator == "auto":
-        steps: dict[str, Any] = {"frames": frames, "frame_dt": frame_dt, "gravity": gravity, "colliders": colliders}
-        config = choose_integrator(particles, grid, table, config, **steps)
+    config = choose_integrator(
+        particles, grid, table, config, frames=frames, frame_dt=frame_dt, gravity=gravity, colliders=colliders
+    )
     duration = float(frame_dt)
     time = frames * duration
     needed = _substeps_needed(particles, grid, table, config, duration, gravity, colliders, fall=time, until=time)
@@ -100,22 +122,71 @@ def choose_substeps(
     return max(-(-needed // unit) * unit, 1)
 
 
-def first_substeps(
+class SubstepRule(NamedTuple):
+    """The number of substeps of each frame of a simulation (host); `substep_rule` makes it."""
+
+    config: SimConfig  # with its integrator decided
+    first: int  # the fewest substeps of a frame
+    adaptive: bool  # whether frames take more where the speed at their beginning asks for them
+    grid: Grid
+    table: MaterialTable
+    frame_dt: float  # [s]
+    gravity: Any  # [m/s²]
+    colliders: tuple[Collider, ...]
+
+    def of_frame(self, particles: Particles, frame: int) -> int:
+        """Substeps of a frame, numbered from 0, that begins with these particles.
+
+        Raises:
+            InputError: no step is stable.
+        """
+        if not self.adaptive:
+            return self.first
+        return frame_substeps(
+            self.first,
+            particles,
+            self.grid,
+            self.table,
+            self.config,
+            frame=frame,
+            frame_dt=self.frame_dt,
+            gravity=self.gravity,
+            colliders=self.colliders,
+        )
+
+
+def substep_rule(
     particles: Particles,
     grid: Grid,
     table: MaterialTable,
     config: SimConfig,
-    **steps: Any,
-) -> tuple[SimConfig, int]:
-    """Settings with the integrator decided, and the substeps per frame that a simulation begins with (host).
+    *,
+    frames: int,
+    frame_dt: Float[Array, ""] | float,
+    gravity: Vector,
+    colliders: tuple[Collider, ...] = (),
+) -> SubstepRule:
+    """The rule for a simulation that begins with these particles (host): `config.substeps`, or else what is stable.
 
-    In a domain without walls within reach only time bounds how far matter falls, and few scenes fall for all of it. So
-    they begin with what a fall through the particles' own extent needs, and `frame_substeps` takes more where the speed
-    asks for them. `steps` are the other arguments of `choose_substeps`.
+    The arguments are those of `choose_substeps`. In a domain without walls within reach (`vast_grid`) only time bounds
+    how far matter falls, and few scenes fall for all of it. There a simulation begins with the substeps of a fall
+    through the particles' own extent, and `frame_substeps` takes more where the speed asks for them.
+
+    Raises:
+        InputError: a number is out of range, or no step is stable.
     """
-    near = _near(particles, grid) if is_open(grid) else grid
-    config = choose_integrator(particles, near, table, config, **steps)
-    return config, choose_substeps(particles, near, table, config, **steps)
+    chosen = config.substeps is None
+    near = _near(particles, grid) if chosen and is_open(grid) else grid
+    config = choose_integrator(
+        particles, near, table, config, frames=frames, frame_dt=frame_dt, gravity=gravity, colliders=colliders
+    )
+    first = config.substeps
+    if first is None:
+        first = choose_substeps(
+            particles, near, table, config, frames=frames, frame_dt=frame_dt, gravity=gravity, colliders=colliders
+        )
+    adaptive = chosen and is_open(grid)
+    return SubstepRule(config, first, adaptive, grid, table, float(frame_dt), gravity, colliders)
 
 
 def frame_substeps(

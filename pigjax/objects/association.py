@@ -1,4 +1,4 @@
-"""Instance masks whose ids mean nothing across views, linked through the Gaussians that they show."""
+"""Association: instance masks with arbitrary ids in each view, linked across views through the Gaussians they show."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from pigjax.core.arguments import checked
 from pigjax.core.arrays import Scalar
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
-from pigjax.segmentation import check_masks, front_of
+from pigjax.segmentation import check_masks, on_surface
 from pigjax.splat import Gaussians, RenderConfig, Splats
 from pigjax.splatting.types import as_splats
 
-_LEAST_SHOWN = 0.1  # share of a group that a view must show to say what the group belongs to
-_SAMPLE = 20_000  # Gaussians that the order of the views is chosen by
+_LEAST_SHOWN = 0.1  # share of a group that a view must show to count for the consensus
+_SAMPLE = 20_000  # Gaussians by which the order of the views is chosen
 
 
 class Association(NamedTuple):
@@ -29,12 +29,12 @@ class Association(NamedTuple):
 
     masks: Int[np.ndarray, "t h w"]  # 0 = background; object 1 is the one most seen
     num_ids: int  # ids run from 0 to num_ids - 1
-    scores: Float[np.ndarray, "m"]  # mean over an object's views of how well the other views agree, 0 to 1; 0 for id 0
+    scores: Float[np.ndarray, "m"]  # mean over the views of an object of its IoU with the other views; 0 for id 0
     views: Int[np.ndarray, "m"]  # number of views that show each id
 
 
 class _View(NamedTuple):
-    """The front Gaussians of a view, and the number of the mask that each lies in, 0 = background."""
+    """The Gaussians on the surface in a view, and the number of the mask that each lies in, 0 = background."""
 
     gaussians: np.ndarray  # [o]
     masks: np.ndarray  # [o]
@@ -54,26 +54,27 @@ def associate_masks(
 ) -> Association:
     """Link the masks of all views that show one object. Host.
 
-    The Gaussians that a mask shows, by the test of `lift_masks`, are compared with those of each group of a growing
-    bank (Gaga; Lyu et al. 2024), views that share most Gaussians with the bank first. Within a view the assignment is
-    one-to-one and maximises the sum of the overlaps; a mask without a group founds one. At last the groups that are
-    pieces of one object join: those that mostly lie in one mask where a view shows both (view consensus; Yan et al.
-    2024, MaskClustering), which makes up for what an early view did not know.
+    The Gaussians that a mask shows, by the visible-surface test of `lift_masks`, are compared with those of each group
+    of a growing bank (Gaga; Lyu et al. 2024); views that share most Gaussians with the bank come first. Within a view
+    the assignment is one-to-one and maximises the sum of the overlaps; a mask without a group starts a new one. Then
+    groups that are pieces of one object are merged: those that mostly lie in one mask where a view shows both (view
+    consensus; Yan et al. 2024, MaskClustering). This corrects views that were assigned before the bank was complete.
 
     Args:
         gaussians: the scene.
         cameras: batch of posed views.
         per_view_masks: id of every pixel, 0 = background; other ids are arbitrary in each view.
-        threshold: least overlap with a group, as intersection over union of the Gaussians that the view shows.
-        merge: groups join where in more than this share of the views that show both one mask holds both. 1 keeps all
-            apart, as where the masks of a view are known to be whole objects.
-        tau_T: transmittance below which the surface lies, in [0, 1].
-        tau_d: depth tolerance relative to the surface depth, in [0, 1].
+        threshold: least overlap with a group, as IoU of the Gaussians that the view shows; low by default, since an
+            early view knows only a part of an object.
+        merge: groups are merged where one mask holds both in more than this share of the views that show both; a
+            majority by default. 1 merges none, for masks that are known to be whole objects.
+        tau_T: transmittance below which the surface lies, in [0, 1]; the paper's default.
+        tau_d: depth tolerance relative to the surface depth, in [0, 1]; the paper's default.
         config: the renderer's settings.
 
     Returns:
-        Objects are numbered from 1 by falling number of sightings of their Gaussians. A mask that shows no Gaussian
-        becomes background.
+        Masks whose ids are numbered from 1 by falling number of observations of their Gaussians. A mask that shows no
+        Gaussian becomes background.
 
     Raises:
         InputError: no views, masks that do not fit the cameras or show no Gaussian at all, negative ids, or thresholds
@@ -108,10 +109,13 @@ def associate_masks(
 def compact_ids(
     masks: Integer[Array | np.ndarray, "*t h w"],
 ) -> tuple[Integer[np.ndarray, "*t h w"], Int[np.ndarray, "m"]]:
-    """Masks with the ids that occur numbered from 0, in the narrowest type, and the id of each number. Host.
+    """Masks whose ids are renumbered from 0 without gaps, in the narrowest type, and the id of each number. Host.
 
     `lift_masks` counts [n num_ids] votes: with ids far apart, lift the compact masks and read `ids[object_id]`.
-    The background is number 0, whether it occurs or not.
+    The background is number 0, even if it does not occur.
+
+    Args:
+        masks: ids of any size, 0 = background.
 
     Raises:
         InputError: an id is negative.
@@ -126,8 +130,8 @@ def compact_ids(
 
 @eqx.filter_jit
 def _mask_of_each(splats: Splats, camera: Camera, mask, tau_T, tau_d, config: RenderConfig):
-    """The mask that each Gaussian on the surface lies in, -1 for those that are not on it."""
-    pixel, front, _ = front_of(splats, camera, tau_T, tau_d, config)
+    """The mask that each Gaussian on the surface lies in, -1 for the others."""
+    pixel, front, _ = on_surface(splats, camera, tau_T, tau_d, config)
     return jnp.where(front, mask.ravel()[pixel], -1)
 
 
@@ -135,7 +139,7 @@ def _assign(views: Sequence[_View], counts: Sequence[int], count: int, threshold
     """The group of every mask of every view, -1 for the background and for masks without Gaussians."""
     groups = [np.full(number, -1) for number in counts]
     shape = count, sum(counts)
-    bank = sparse.csr_array(shape, dtype=np.float32)  # how often each Gaussian was seen in each group
+    bank = sparse.csr_array(shape, dtype=np.float32)  # observations of each Gaussian in each group
     known = 0
     for index in _most_shared_first(views, count):
         group = groups[index]
@@ -147,12 +151,12 @@ def _assign(views: Sequence[_View], counts: Sequence[int], count: int, threshold
         founders = np.setdiff1d(views[index].masks, [0, *masks[matched]])
         group[founders] = known + np.arange(len(founders))
         known += len(founders)
-        bank = bank + _sightings(views[index], group, shape)
+        bank = bank + _observations(views[index], group, shape)
     return groups
 
 
 def _most_shared_first(views: Sequence[_View], count: int) -> list[int]:
-    """Order of the views: next comes the one that shares most Gaussians with those before it."""
+    """Order of the views: the next one shares most Gaussians with those before it."""
     step = -(-count // _SAMPLE)
     seen = np.zeros((len(views), -(-count // step)), np.float32)
     for row, view in zip(seen, views):
@@ -171,9 +175,9 @@ def _most_shared_first(views: Sequence[_View], count: int) -> list[int]:
 
 
 def _overlaps(view: _View, count: int, bank: sparse.csr_array) -> np.ndarray:
-    """Intersection over union [m g] of masks and groups, among the Gaussians of the view that the bank knows.
+    """IoU [m g] of masks and groups, among the Gaussians of the view that are in the bank.
 
-    A Gaussian is in each group by its share of the Gaussian's sightings.
+    A Gaussian belongs to each group by the group's share of its observations.
     """
     rows = bank[view.gaussians]
     total = rows.sum(1)
@@ -188,10 +192,10 @@ def _overlaps(view: _View, count: int, bank: sparse.csr_array) -> np.ndarray:
 
 
 def _merge(views: Sequence[_View], groups: list[np.ndarray], count: int, merge: float) -> list[np.ndarray]:
-    """Join, pair by pair, the groups that mostly lie in one mask of the views that show both."""
+    """Merge, pair by pair, the groups that mostly lie in one mask of the views that show both."""
     while True:
         names, flat = np.unique(np.concatenate(groups), return_inverse=True)
-        # the first name is the background's -1, which stays
+        # the first name is -1, the background, which is not merged
         groups = np.split(flat - 1, np.cumsum([len(group) for group in groups])[:-1])
         consensus = _consensus(views, groups, count, len(names) - 1)
         first, second = np.nonzero(np.triu(consensus > merge, 1))
@@ -208,14 +212,14 @@ def _merge(views: Sequence[_View], groups: list[np.ndarray], count: int, merge: 
 
 
 def _consensus(views: Sequence[_View], groups: list[np.ndarray], count: int, number: int) -> np.ndarray:
-    """Of all sightings of two Gaussians, one of each group, in masks of a view: the share in one mask [g g]."""
+    """Share [g g] of the observations of two Gaussians, one of each group, in which one mask holds both."""
     shape = count, number
-    bank = _sum_of_sightings(views, groups, shape)
+    bank = _sum_of_observations(views, groups, shape)
     sizes = np.maximum(bank.sum(0), 1)
     same, together = np.zeros((2, number, number))
     for view, group in zip(views, groups):
         inside = (_members(view, len(group)) @ bank[view.gaussians]).toarray()[1:] / sizes
-        # a little that spills over the rim of another mask is no evidence
+        # a small part of a group on the rim of another mask is no evidence
         inside *= inside.sum(0) >= _LEAST_SHOWN
         shown = inside.sum(0)
         same += inside.T @ inside
@@ -224,39 +228,39 @@ def _consensus(views: Sequence[_View], groups: list[np.ndarray], count: int, num
 
 
 def _by_size(views: Sequence[_View], groups: list[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
-    """Object number of every mask, 0 for none, and sightings of each object, most first."""
-    sightings = np.zeros(max(int(group.max()) for group in groups) + 2)
+    """Object number of every mask, 0 for none, and observations of each object, largest first."""
+    observations = np.zeros(max(int(group.max()) for group in groups) + 2)
     for view, group in zip(views, groups):
-        np.add.at(sightings, group[view.masks] + 1, 1)
-    sightings[0] = np.inf
-    order = np.argsort(-sightings, kind="stable")
+        np.add.at(observations, group[view.masks] + 1, 1)
+    observations[0] = np.inf
+    order = np.argsort(-observations, kind="stable")
     number = np.argsort(order).astype(np.int32)
-    return [number[group + 1] for group in groups], sightings[order]
+    return [number[group + 1] for group in groups], observations[order]
 
 
 def _scores(views: Sequence[_View], numbers: list[np.ndarray], count: int, number: int) -> np.ndarray:
-    """Mean overlap of each object in a view with what the other views call it."""
+    """Mean IoU of each object in a view with the same object in the other views."""
     shape = count, number
     whole = [_View(view.gaussians, names[view.masks]) for view, names in zip(views, numbers)]
     same = np.where(np.arange(number) > 0, np.arange(number), -1)
-    bank = _sum_of_sightings(whole, [same] * len(whole), shape)
+    bank = _sum_of_observations(whole, [same] * len(whole), shape)
     total, shown = np.zeros((2, number))
     for view in whole:
-        overlap = np.diagonal(_overlaps(view, number, bank - _sightings(view, same, shape)))
+        overlap = np.diagonal(_overlaps(view, number, bank - _observations(view, same, shape)))
         total += overlap
         shown[np.unique(view.masks)] += 1
     return np.divide(total, shown, out=np.zeros(number), where=shown > 0)
 
 
-def _sum_of_sightings(views: Sequence[_View], groups: Sequence[np.ndarray], shape) -> sparse.csr_array:
+def _sum_of_observations(views: Sequence[_View], groups: Sequence[np.ndarray], shape) -> sparse.csr_array:
     bank = sparse.csr_array(shape, dtype=np.float32)
     for view, group in zip(views, groups):
-        bank = bank + _sightings(view, group, shape)
+        bank = bank + _observations(view, group, shape)
     return bank
 
 
-def _sightings(view: _View, groups: np.ndarray, shape) -> sparse.csr_array:
-    """One sighting [n g] of each Gaussian that lies in a mask of a group."""
+def _observations(view: _View, groups: np.ndarray, shape) -> sparse.csr_array:
+    """One observation [n g] of each Gaussian that lies in a mask of a group."""
     of_each = groups[view.masks]
     inside = of_each >= 0
     where = view.gaussians[inside], of_each[inside]
@@ -264,6 +268,6 @@ def _sightings(view: _View, groups: np.ndarray, shape) -> sparse.csr_array:
 
 
 def _members(view: _View, count: int) -> sparse.csr_array:
-    """Which Gaussians of a view lie in which mask [m o]."""
+    """Membership [m o] of the Gaussians of a view in its masks."""
     size = len(view.masks)
     return sparse.csr_array((np.ones(size, np.float32), (view.masks, np.arange(size))), (count, size))

@@ -1,4 +1,4 @@
-"""Editing a scene by object: one object alone, the scene without it, and the hole that it leaves."""
+"""Editing a scene by object: extract an object, remove it, and find the hole that it leaves."""
 
 from __future__ import annotations
 
@@ -22,6 +22,11 @@ from pigjax.splatting.types import as_splats
 def extract_object(gaussians: Gaussians, labels: Labels, object_id: int) -> Gaussians:
     """The Gaussians of one object, in their old order. Host.
 
+    Args:
+        gaussians: the scene.
+        labels: of `lift_masks`.
+        object_id: the object.
+
     Raises:
         InputError: no Gaussian has this id.
     """
@@ -31,6 +36,11 @@ def extract_object(gaussians: Gaussians, labels: Labels, object_id: int) -> Gaus
 @checked
 def remove_object(gaussians: Gaussians, labels: Labels, object_id: int) -> Gaussians:
     """The scene without one object, in its old order. Host.
+
+    Args:
+        gaussians: the scene.
+        labels: of `lift_masks`.
+        object_id: the object.
 
     Raises:
         InputError: no Gaussian has this id.
@@ -49,18 +59,18 @@ def hole_mask(
     seen: Bool[Array, "n"] | Float[Array, "n"],
     config: RenderConfig = RenderConfig(),
 ) -> Bool[Array, "h w"]:
-    """Pixels that an object hides and that hold nothing known once it is gone: what an inpainter must fill in.
+    """Pixels that an object hides and that are unknown without it: the input of an inpainter.
 
-    The object has more than half of such a pixel, and what the views saw of the rest of the scene would cover less
-    than half of it.
+    The object has more than half of such a pixel, and the Gaussians of the rest of the scene that the views saw would
+    cover less than half of it.
 
     Args:
         gaussians: the whole scene.
-        labels: as `lift_masks` gives them.
-        object_id: the object that goes; may be swept.
+        labels: of `lift_masks`.
+        object_id: the object to remove; may be swept.
         camera: a single camera.
-        seen: which Gaussians the photos saw, e.g. `contributions(gaussians, cameras) > 1`: others are guesses of the
-            reconstruction.
+        seen: Gaussians that the photos saw, for example `contributions(gaussians, cameras) > 1`; others are guesses
+            of the reconstruction.
         config: the renderer's settings.
     """
     splats = as_splats(gaussians)

@@ -1,29 +1,27 @@
-"""How well the objects of a scene agree with masks of its views: prompts to ids, ids to masks, masks to scores."""
+"""Evaluation of objects against masks of views: prompts to ids, ids to masks, masks to scores."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
 from pigjax.core.metrics import MaskScores, mean_iou, score_masks
-from pigjax.segmentation import Labels, object_mask
-from pigjax.splat import Gaussians, RenderConfig, Splats, render
+from pigjax.segmentation import Labels, object_mask, pixel_ids
+from pigjax.splat import Gaussians, RenderConfig, Splats
 from pigjax.splatting.types import as_splats
 
 LEVELS = ("isolated", "visible", "pixels")
-_IDS_TOGETHER = 32  # ids drawn in one pass, which bounds the memory
 
 
 class Evaluation(NamedTuple):
-    """Scores of a scene on each level, with what they were computed from."""
+    """Scores of a scene on each level, and the ids and masks that they were computed from."""
 
     scores: dict[str, MaskScores]  # by level
     objects: dict[str, int | None]  # id of each prompt, None where no object was found
@@ -41,16 +39,16 @@ def evaluate_labels(
     config: RenderConfig = RenderConfig(),
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Evaluation:
-    """mIoU and mBIoU of labelled Gaussians by the protocol of Gaussian Grouping, host.
+    """mIoU and mBIoU of labelled Gaussians by the protocol of Gaussian Grouping (Ye et al. 2024). Host.
 
     Three levels: "isolated" and "visible" are `object_mask` > 0.5 in these modes, which judge the Gaussians of the
-    object (3D); "pixels" gives each pixel the id with the largest share of it, background among them (2D).
+    object (3D); "pixels" gives each pixel the id with the largest share, the background included (2D).
 
     Args:
         gaussians: the scene.
         labels: object of each Gaussian; those never seen (-1) are background.
         cameras: single cameras by view.
-        truths: masks by (view, prompt); a prediction of another size is resized to the nearest pixel.
+        truths: masks by (view, prompt); a prediction of another size is resized by nearest neighbour.
         objects: id of each prompt. None, or an id that no Gaussian has: the prompt is missing and scores 0.
         config: the renderer's settings.
         progress: called with the number of views done and of all.
@@ -83,39 +81,12 @@ def evaluate_labels(
     return Evaluation(scores, found, masks)
 
 
-def pixel_ids(
-    gaussians: Gaussians | Splats,
-    labels: Labels,
-    camera: Camera,
-    *,
-    keep: Sequence[int] = (),
-    config: RenderConfig = RenderConfig(),
-) -> tuple[Int[np.ndarray, "h w"], dict[int, Float[np.ndarray, "h w"]]]:
-    """The id with the largest share of each pixel, and the shares of the ids in `keep`, host.
-
-    The share of the background, id 0, is that of its Gaussians, of those never seen, and of what shines through. Ids
-    are drawn 32 at a time, so that memory does not grow with their number; equal shares go to the lowest id.
-    """
-    splats = as_splats(gaussians)
-    object_id = jnp.maximum(jnp.asarray(labels.object_id), 0)
-    present = np.unique(np.append(0, np.asarray(object_id)))
-    together = min(len(present), _IDS_TOGETHER)
-    groups = np.full((-(-len(present) // together), together), -1)
-    groups.ravel()[: len(present)] = present
-    best = jnp.full((camera.height, camera.width), -1.0)
-    winner = jnp.zeros((camera.height, camera.width), int)
-    shares: dict[int, np.ndarray] = {}
-    for group in groups:
-        weights, alpha = _shares(splats, object_id, jnp.asarray(group), camera, config)
-        weights = weights.at[..., 0].add(jnp.where(group[0] == 0, 1 - alpha, 0.0))
-        shares |= {int(number): np.asarray(weights[..., i]) for i, number in enumerate(group) if number in keep}
-        largest, here = jnp.max(weights, -1), jnp.asarray(group)[jnp.argmax(weights, -1)]
-        winner, best = jnp.where(largest > best, here, winner), jnp.maximum(largest, best)
-    return np.asarray(winner), shares
-
-
 def reference_view(truths: Mapping[tuple[str, str], Any]) -> str:
-    """The view that shows most prompts, of equal ones the first."""
+    """The view that shows most prompts; of equal ones the first.
+
+    Args:
+        truths: masks by (view, prompt).
+    """
     counts: dict[str, int] = {}
     for view, _ in truths:
         counts[view] = counts.get(view, 0) + 1
@@ -125,7 +96,7 @@ def reference_view(truths: Mapping[tuple[str, str], Any]) -> str:
 def ground_prompts(
     ids: Int[Array | np.ndarray, "h w"], truths: Mapping[str, Bool[np.ndarray, "_ _"]]
 ) -> dict[str, int | None]:
-    """The object that overlaps each prompt's mask best in one view, by IoU; None where none does. Host.
+    """The object with the largest IoU with each prompt's mask in one view; None where none overlaps it. Host.
 
     Args:
         ids: object of each pixel, 0 = background.
@@ -138,11 +109,3 @@ def ground_prompts(
         best = max(overlaps, key=lambda number: overlaps[number], default=None)
         objects[prompt] = best if best is not None and overlaps[best] > 0 else None
     return objects
-
-
-@eqx.filter_jit
-def _shares(splats: Splats, object_id, group, camera: Camera, config: RenderConfig):
-    """Share [h w m] of each id of the group, and the coverage [h w] of all splats."""
-    membership = (object_id[:, None] == group).astype(splats.opacities.dtype)
-    frame = render(splats, camera, config, outputs=("alpha", "object_weights"), object_weights=membership)
-    return frame.object_weights, frame.alpha

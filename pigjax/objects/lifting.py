@@ -1,4 +1,4 @@
-"""Masks of files lifted to Gaussians, as the commands and scenes do it."""
+"""Lifting of masks with any ids to Gaussians, as commands and scenes do it."""
 
 from __future__ import annotations
 
@@ -24,23 +24,24 @@ def lift(
     fill: bool = True,
     **settings: Any,
 ) -> Labels:
-    """`lift_masks` for the ids that occur, in memory by their number; the unseen take their neighbours' id. Host.
+    """`lift_masks` for the ids that occur; unseen Gaussians take the id of their neighbours. Host.
 
-    With `min_seen` nothing is filled: what is hidden on purpose would come back.
+    Memory grows with the number of ids, not with the largest. With `min_seen` nothing is filled, since that would undo
+    it.
 
     Args:
         gaussians: the scene.
         cameras: batch of posed views.
         masks: id of every pixel, 0 = background; ids may lie far apart.
-        fill: give Gaussians that no view saw the id of their neighbours.
-        settings: of `lift_masks`, but for `num_ids`.
+        fill: give Gaussians that no view saw the id of their neighbours (`fill_unseen`).
+        settings: of `lift_masks`, except `num_ids`.
 
     Returns:
-        Labels whose `object_id` are the ids of the masks. Where these are not 0, 1, 2, ..., `Labels.ids` says which id
-        each column of the votes counts.
+        Labels whose `object_id` are the ids of the masks. Where these are not 0, 1, 2, ..., `Labels.ids` holds the id
+        of each column of the votes.
 
     Raises:
-        InputError: no camera sees a Gaussian, or as `lift_masks` raises it.
+        InputError: no camera sees a Gaussian, or as of `lift_masks`.
     """
     compact, ids = compact_ids(masks)
     labels = lift_masks(gaussians, cameras, compact, num_ids=max(len(ids), 2), **settings)

@@ -1,4 +1,4 @@
-"""Pictures of objects: one colour per id, masks laid over photos, and the sheet that says which id is which."""
+"""Pictures of objects: one colour per id, overlays on photos, legends and comparison sheets."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import colorsys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Integer, Num, UInt8
+from jaxtyping import Array, Bool, Integer, Num, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from pigjax.core.errors import InputError
@@ -18,12 +17,12 @@ _GOLDEN = 0.6180339887498949  # steps of hue that keep neighbouring ids far apar
 
 
 def id_colours(n: int) -> UInt8[np.ndarray, "n 3"]:
-    """Colours of the ids 0 to n - 1: grey for the background, then hues at golden steps, host."""
+    """Colours of the ids 0 to n - 1: grey for the background, then hues at steps of the golden ratio. Host."""
     return np.array([_colour(number) for number in range(n)], np.uint8).reshape(n, 3)
 
 
 def colours_of(ids: Integer[Array | np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n 3"]:
-    """Colours of these ids, as `id_colours` gives them, in memory by how many differ; below 0 is background. Host."""
+    """Colour of each id, as of `id_colours`; ids below 0 are background. Memory grows with the distinct ids. Host."""
     present, place = np.unique(np.maximum(np.asarray(ids), 0), return_inverse=True)
     table = np.array([_colour(number) for number in present.tolist()], np.uint8).reshape(-1, 3)
     return table[place.reshape(np.shape(ids))]
@@ -32,25 +31,10 @@ def colours_of(ids: Integer[Array | np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n 
 def _colour(number: int) -> tuple[int, int, int]:
     if number == 0:
         return 128, 128, 128
-    # saturation and brightness change more slowly than the hue, so that a hue that returns looks different
+    # saturation and brightness change more slowly than the hue, so that two ids of like hue look different
     k = number - 1
     red, green, blue = colorsys.hsv_to_rgb(k * _GOLDEN % 1, (0.85, 0.5)[k // 8 % 2], (1.0, 0.7)[k // 16 % 2])
     return round(255 * red), round(255 * green), round(255 * blue)
-
-
-def id_image(
-    object_weights: Float[Array, "*b h w m"], threshold: float = 0.5, *, ids: Int[Array | np.ndarray, "m"] | None = None
-) -> Int[Array, "*b h w"]:
-    """The id with the largest share of each pixel; 0 where all objects together have at most `threshold`.
-
-    Args:
-        object_weights: share of each pixel.
-        threshold: of the sum of shares.
-        ids: the id of each channel; if not given, channel k is id k.
-    """
-    winner = jnp.argmax(object_weights, -1).astype(jnp.int32)
-    winner = winner if ids is None else jnp.asarray(ids, jnp.int32)[winner]
-    return jnp.where(jnp.sum(object_weights, -1) > threshold, winner, 0)
 
 
 def overlay(
@@ -60,7 +44,7 @@ def overlay(
     *,
     outline: bool = True,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """A picture with its objects tinted in their colours, the background left as it is, host.
+    """A picture with its objects tinted in their colours; the background is not changed. Host.
 
     Args:
         image: 0 to 255 if it holds integers, 0 to 1 if floats.
@@ -92,7 +76,15 @@ def legend_sheet(
     row_height: int = 48,
     width: int = 320,
 ) -> UInt8[np.ndarray, "rows width 3"]:
-    """Which id is which object: colour, id, name and, given a picture with its ids, a thumbnail per object, host."""
+    """Legend with a row per object: colour, id, name and, given a picture with its ids, a thumbnail. Host.
+
+    Args:
+        names: name by id.
+        image: picture for the thumbnails; None: without.
+        ids: id of each pixel of the picture.
+        row_height: of a row [px]; 48 fits a thumbnail and a line of text.
+        width: of the sheet [px].
+    """
     margin, inner = row_height // 8, row_height - 2 * (row_height // 8)
     sheet = Image.new("RGB", (width, row_height * max(len(names), 1)), "white")
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=row_height * 0.4)
@@ -115,10 +107,9 @@ def comparison_sheet(
     *,
     height: int = 128,
 ) -> UInt8[np.ndarray, "rows width 3"]:
-    """Masks beside their truth, a row for each: image, truth, ours, and where they differ, host.
+    """Masks beside their truth, a row for each: image, truth, ours, and their difference. Host.
 
-    In the difference green is right, red is ours alone, blue is the truth's alone. Masks of any size take the size of
-    the image.
+    In the difference, green is right, red is in ours alone, blue in the truth alone. Masks are resized to the image.
 
     Args:
         rows: title, image, truth and our mask.
@@ -150,17 +141,17 @@ def _labelled_strip(title: str, panels: Sequence[Any], height: int, width: int) 
 
 
 def _one_line(text: str) -> str:
-    """A text of any origin as pillow draws it: one line of printable letters, none beyond the widest sheet."""
+    """A text of any origin in one line of at most 500 printable letters, as pillow needs it."""
     return "".join(letter if letter.isprintable() else " " for letter in text[:_LONGEST_TEXT])
 
 
 def _scaled(pixels: np.ndarray, width: int, height: int) -> Image.Image:
-    way = Image.Resampling.NEAREST if pixels.ndim == 2 else Image.Resampling.BOX
-    return Image.fromarray(pixels).resize((width, height), way)
+    resampling = Image.Resampling.NEAREST if pixels.ndim == 2 else Image.Resampling.BOX
+    return Image.fromarray(pixels).resize((width, height), resampling)
 
 
 def _thumbnail(image: np.ndarray, member: np.ndarray, size: int) -> Image.Image | None:
-    """The object cut out on white, or None where it is not in the picture."""
+    """The object cut out on white; None if it is not in the picture."""
     if not member.any():
         return None
     rows, columns = (np.flatnonzero(member.any(axis)) for axis in (1, 0))
@@ -171,7 +162,7 @@ def _thumbnail(image: np.ndarray, member: np.ndarray, size: int) -> Image.Image 
 
 
 def _edges(ids: np.ndarray) -> np.ndarray:
-    """Pixels with a neighbour of another id to any of the four sides."""
+    """Pixels with a neighbour of another id on any of the four sides."""
     padded = np.pad(ids, 1, mode="edge")
     sides = padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]
     return np.any([side != ids for side in sides], axis=0)

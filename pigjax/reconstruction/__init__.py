@@ -1,1 +1,1 @@
-"""Photos to Gaussians: initialisation, training, MCMC relocation, pruning."""
+"""Reconstruction of Gaussians from photos: initialisation, training, MCMC relocation, pruning."""

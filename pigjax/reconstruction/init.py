@@ -1,4 +1,4 @@
-"""Where a reconstruction starts: small round Gaussians on sparse points, or on random ones."""
+"""Initialisation of a reconstruction: small round Gaussians on sparse or random points."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def start_gaussians(
 ) -> Gaussians:
     """Small round Gaussians on sparse points, repeated with jitter up to `count`. Host.
 
-    Of more points than `count`, a sample that covers the whole cloud is taken: captures list their points in the order
-    in which they were found, so the first ones lie on one side.
+    Of more points than `count`, a sample that covers the whole cloud is taken: captures list points in the order in
+    which they were found, so the first ones lie on one side.
 
     Args:
         points: positions [m].
-        rgb: their colours, 0 to 1.
-        count: of the Gaussians.
-        sh_degree: bands of their view-dependent colour.
+        rgb: colours of the points, 0 to 1.
+        count: number of Gaussians.
+        sh_degree: degree of the spherical harmonics, 0 to 3.
         seed: of the sample and of the jitter.
 
     Raises:
@@ -43,7 +43,7 @@ def start_gaussians(
     pick = np.concatenate(
         [np.arange(min(count, len(points))), rng.integers(len(points), size=max(count - len(points), 0))]
     )
-    # a floater's neighbours are a whole scene away
+    # the neighbours of a floater may be far away: its size is at most that of the scene
     gap = np.minimum(cKDTree(points).query(points, k=4)[0][:, 1:].mean(1), size)[pick]
     jitter = rng.normal(size=(count, 3)) * 0.5 * gap[:, None] * (np.arange(count) >= len(points))[:, None]
     scale = gap * (len(points) / max(count, len(points))) ** 0.5 * 0.7
@@ -61,10 +61,15 @@ def start_gaussians(
 
 
 def covering_sample(points: Float[np.ndarray, "n 3"], count: int, *, seed: int = 0) -> Int[np.ndarray, "count"]:
-    """Indices, rising, of `count` of the points that lie as the whole cloud does. Host.
+    """Indices, ascending, of a stratified sample of points. Host.
 
-    The points are walked along a Morton curve through their ranks along the three axes, which visits one region after
-    the other, and one point is drawn from each of `count` equal stretches of it.
+    The points are ordered along a Morton curve through their ranks along the three axes, which visits one region after
+    the other; one point is drawn from each of `count` equal intervals of it.
+
+    Args:
+        points: positions [m].
+        count: size of the sample.
+        seed: of the draws.
     """
     ranks = [np.unique(column, return_inverse=True)[1].reshape(-1) for column in points.T]
     bits = 16
@@ -80,7 +85,16 @@ def covering_sample(points: Float[np.ndarray, "n 3"], count: int, *, seed: int =
 def random_points(
     cameras: Camera, count: int, *, seed: int = 0
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Grey points in the ball that the cameras look at, for captures without sparse points. Host."""
+    """Grey points in the ball that the cameras look at, for captures without sparse points. Host.
+
+    Args:
+        cameras: batch of views.
+        count: number of points.
+        seed: of the positions.
+
+    Returns:
+        Positions [m] and colours (0.5).
+    """
     rng = np.random.default_rng(seed)
     position, forward = np.asarray(cameras.position), np.asarray(cameras.world_to_cam)[:, 2, :3]
     # the point nearest to all optical axes

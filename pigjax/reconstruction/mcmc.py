@@ -1,6 +1,6 @@
-"""Markov-chain moves of 3D Gaussians (Kheradmand et al. 2024): dead splats move onto live ones, and all are shaken.
+"""MCMC moves of 3D Gaussians (Kheradmand et al. 2024): relocation of dead Gaussians, and noise on the centres.
 
-The number of splats never changes, so shapes stay static while the scene redistributes its budget.
+The number of Gaussians does not change, so shapes stay static while they are redistributed over the scene.
 """
 
 from __future__ import annotations
@@ -17,18 +17,23 @@ from pigjax.core.linalg import quat_to_matrix
 from pigjax.splat import Gaussians
 
 DEAD_OPACITY = 0.005
-_MOST_COPIES = 8  # of one splat in one move; the formula's alternating sum loses float32 digits beyond
+_MOST_COPIES = 8  # of one Gaussian in one move; beyond, the alternating sum of equation 9 loses float32 digits
 
 
 def relocate(gaussians: Gaussians, key: PRNGKeyArray) -> tuple[Gaussians, Float[Array, "n"], Int[Array, ""]]:
-    """Move every dead splat onto a live one drawn by opacity, and thin the pile so that the picture stays the same.
+    """Move every dead Gaussian onto a live one drawn by opacity; opacities and scales change to keep the picture.
+
+    Args:
+        gaussians: in training.
+        key: random key.
 
     Returns:
-        The Gaussians, 1 for splats whose optimiser state still holds and 0 for those that changed, and how many moved.
+        The Gaussians; 1 for Gaussians whose optimiser state stays valid and 0 for those that changed; and the number
+        of Gaussians that moved.
     """
     opacities = jax.nn.sigmoid(gaussians.logit_opacities)
     dead = opacities < DEAD_OPACITY
-    # with nothing alive there is nowhere to go
+    # without a live Gaussian there is no target
     dead &= ~jnp.all(dead)
     # `categorical` would draw a number for every pair of splats
     target = jax.random.choice(key, opacities.shape[0], opacities.shape, p=jnp.where(dead, 0.0, opacities))
@@ -44,7 +49,12 @@ def relocate(gaussians: Gaussians, key: PRNGKeyArray) -> tuple[Gaussians, Float[
 
 
 def split_opacity(opacity: Float[Array, "n"], copies: Int[Array, "n"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """Opacity of each of N coincident copies, and the factor on their scales, that keep the blended splat (eq. 9)."""
+    """Opacity of each of N coincident copies, and the factor on their scales, which keep the picture (equation 9).
+
+    Args:
+        opacity: of the Gaussian before, in [0, 1].
+        copies: N, at least 1.
+    """
     opacity = jnp.clip(opacity, DEAD_OPACITY, 1 - 1e-6)
     each = -jnp.expm1(jnp.log1p(-opacity) / copies)
     total = jnp.zeros_like(opacity)
@@ -55,7 +65,13 @@ def split_opacity(opacity: Float[Array, "n"], copies: Int[Array, "n"]) -> tuple[
 
 
 def shake(gaussians: Gaussians, key: PRNGKeyArray, scale: Float[Array, ""] | float) -> Gaussians:
-    """Noise on the centres, shaped by each covariance and only on faint splats, so that they explore (eq. 8)."""
+    """Noise on the centres, shaped by each covariance and only on faint Gaussians, so that they explore (equation 8).
+
+    Args:
+        gaussians: in training.
+        key: random key.
+        scale: factor on the covariance [1/m], see `train.noise_at`.
+    """
     faint = jax.nn.sigmoid(-100 * (jax.nn.sigmoid(gaussians.logit_opacities) - DEAD_OPACITY))
     noise = jax.random.normal(key, gaussians.means.shape, gaussians.means.dtype) * (faint * scale)[:, None]
     rotation = quat_to_matrix(gaussians.quats)

@@ -1,7 +1,11 @@
-"""Fitting Gaussians to photos: L1 + D-SSIM, Adam groups as 3DGS, relocation at a constant number of splats."""
+"""Reconstruction of Gaussians from photos: L1 and D-SSIM, Adam, relocation at a constant number of splats.
+
+The loss is that of 3DGS (Kerbl et al. 2023); relocation and noise are those of 3DGS-MCMC (Kheradmand et al. 2024).
+"""
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -34,12 +38,12 @@ from pigjax.reconstruction.train import (
     twist_of,
 )
 from pigjax.splat import Gaussians, render
-from pigjax.splatting.binning import bands_of
+from pigjax.splatting.binning import shards_of
 from pigjax.splatting.sharding import replicate
 
 
 class Progress(NamedTuple):
-    """Where a reconstruction stands."""
+    """Progress of a reconstruction."""
 
     step: int
     loss: float
@@ -51,12 +55,12 @@ class Progress(NamedTuple):
 
 @dataclass
 class Reconstruction:
-    """What a reconstruction hands back."""
+    """Result of a reconstruction."""
 
     gaussians: Gaussians
     psnr: dict[str, float]  # per held-out view [dB]
     ssim: dict[str, float]
-    cameras: Camera  # of the training views, corrected where `pose_rate` asks for it; the held-out ones stay
+    cameras: Camera  # of the training views, corrected if `pose_rate` > 0
     trained_on: tuple[str, ...]  # their names
     history: list[Progress] = field(default_factory=list)
     relocated: int = 0
@@ -86,30 +90,32 @@ def reconstruct(
     """Fit Gaussians to the training views, and score the held-out ones (split "test"). Host.
 
     Args:
-        views: photos with cameras, and with masks where the settings ask for them.
+        views: photos with cameras, and with masks if the settings need them.
         config: steps, splats and rates.
-        points: positions [m] and colours of sparse points; None starts from random ones.
-        checkpoint: file that is written at every evaluation; if it exists the run goes on from it, with the same
-            result as an unbroken one.
+        points: positions [m] and colours (0 to 1) of sparse points; None: random points.
+        checkpoint: file that is written at every evaluation; if it exists, the run is resumed from it, with the same
+            result as an uninterrupted one.
         previews: folder for a picture of the first held-out (or else training) view beside its photo, every
             `config.preview_every` steps.
-        callback: told the progress every few dozen steps.
-        overwrite: start over where the checkpoint was made from something else, instead of refusing it.
+        callback: called with the progress every few dozen steps.
+        overwrite: start over if the checkpoint was made from other inputs, instead of refusing it.
+
+    Returns:
+        Gaussians, scores of the held-out views, and corrected cameras.
 
     Raises:
         StaleError: the checkpoint was made from other photos, cameras, masks, points or settings; it names which.
         InputError: no training views, too few points, or no masks where the settings need them.
     """
-    # the capacity of a picture would drop splats without a word
+    # with a capacity, splats would be dropped silently
     config = replace(config, render=replace(config.render, capacity=None, differentiation="reverse"))
-    train = views.subset("train") if "train" in views.splits else views
-    held_out = views.subset("test") if "test" in views.splits else None
+    train, held_out = views.training, views.held_out
     if points is None:
         points = random_points(train.cameras, min(config.splats, 5000), seed=config.seed)
     extent = scene_extent(points[0], name="points").spread
     pose_rate = optax.exponential_decay(config.pose_rate, config.steps, 0.1)
     optimizers = optimizer_of(config, extent), optax.adam(pose_rate)
-    bands = bands_of(train.cameras, config.render)
+    shards = shards_of(train.cameras, config.render)
 
     def start(count: int) -> FitState:
         gaussians = start_gaussians(*points, count, config.sh_degree, seed=config.seed)
@@ -119,13 +125,13 @@ def reconstruct(
 
     parts = provenance(views, config, points)
     state = start(count_at(0, config))
-    if checkpoint is not None and checkpoint.exists():
+    if checkpoint is not None and os.path.exists(checkpoint):
         state = _resume(checkpoint, start, config, parts, overwrite)
     photos = _photos(train, config)
     if photos.mattes is not None and not photos.mattes.any():
         raise InputError(f"{_asked(config)}: no mask of the training views has any pixel of it.")
     scored = None if held_out is None else _scored(held_out, config)
-    state, photos, cameras = replicate((state, photos, train.cameras), bands)
+    state, photos, cameras = replicate((state, photos, train.cameras), shards)
     result = Reconstruction(state.gaussians, {}, {}, train.cameras, train.names)
     begun = time.perf_counter()
     while (step := int(state.step)) < config.steps:
@@ -133,7 +139,7 @@ def reconstruct(
             state = grow(state, count, config)
         stop = min(config.steps, _next_stop(step, config))
         state, loss = train_steps(state, cameras, photos, config, optimizers, extent, jnp.asarray(stop - step))
-        state = replicate(state, bands)
+        state = replicate(state, shards)
         if config.relocate_every and stop % config.relocate_every == 0 and stop <= config.relocate_until * config.steps:
             state = relocate_dead(state, config)
         psnrs: dict[str, float] = {}
@@ -182,7 +188,7 @@ def _asked(config: FitConfig) -> str:
 
 
 def _scored(views: io.Views, config: FitConfig) -> tuple[tuple[str, ...], Camera, Float[Array, "v h w 3"]] | None:
-    """Names, cameras and pictures to score by, without views in which the masks show nothing of what is fitted."""
+    """Names, cameras and pictures of the views that are scored: those whose masks show the fitted object."""
     photos = _photos(views, config)
     if photos.mattes is None:
         return views.names, views.cameras, photos.images
@@ -194,9 +200,14 @@ def _scored(views: io.Views, config: FitConfig) -> tuple[tuple[str, ...], Camera
 
 
 def provenance(views: io.Views, config: FitConfig, points: Any) -> dict[str, str]:
-    """Parts that a reconstruction depends on, by content.
+    """Digest of each input that a reconstruction depends on.
 
-    How often previews are drawn and how many devices share an image do not count.
+    The period of previews and the number of devices that share an image are not inputs.
+
+    Args:
+        views: photos, cameras and masks.
+        config: settings.
+        points: sparse points.
     """
     settings = replace(config, preview_every=0, render=replace(config.render, bands=1))
     return io.parts_of(
@@ -216,7 +227,7 @@ def _resume(
 ) -> FitState:
     """State of a checkpoint, whose number of splats is one of those that the settings pass through.
 
-    The state at the beginning where it is damaged, or made from something else that may be overwritten.
+    It is the initial state if the checkpoint is damaged, or made from other inputs and may be overwritten.
     """
     counts = sorted({count_at(step, config) for step in range(0, config.steps + 1, config.grow_every)})
     damage: InputError | None = None

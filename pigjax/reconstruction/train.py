@@ -1,4 +1,4 @@
-"""The optimisation under `reconstruct`: settings, state, and the jitted steps of Adam, relocation and growth."""
+"""Training under `reconstruct`: settings, state, and the jitted steps of Adam, relocation and growth."""
 
 from __future__ import annotations
 
@@ -25,26 +25,27 @@ from pigjax.splat import Gaussians, RenderConfig, render
 class FitConfig(eqx.Module):
     """Settings of a reconstruction, all static.
 
-    Learning rates are those of Adam, per step.
+    Learning rates are those of Adam, per step, of the order of those of 3DGS (Kerbl et al. 2023). Relocation, noise and
+    regularizers follow 3DGS-MCMC (Kheradmand et al. 2024).
 
     Raises:
-        InputError: a number is not finite or out of range, or the splats do not grow to their number.
+        InputError: a number is not finite or out of range, or `splats` is not reached within the steps.
     """
 
     steps: int = static_field(default=3000, limits=Limits(1, 100_000_000))
     splats: int = static_field(default=15_000, limits=Limits(4, LARGEST_WHOLE))
-    # doubled every `grow_every` steps up to `splats`; None: all
+    # number at the start, doubled every `grow_every` steps up to `splats`; None: `splats`
     start_splats: int | None = static_field(default=None, limits=Limits(4, LARGEST_WHOLE))
     grow_every: int = static_field(default=500, limits=Limits(1, LARGEST_WHOLE))
     sh_degree: int = static_field(default=1, limits=Limits(0, 3))
     ssim_weight: float = static_field(default=0.2, limits=Limits(0, 1))  # 0 traces no SSIM
     background: float = static_field(default=0.0, limits=Limits(0, 1))  # grey level behind the splats, as in the photos
-    # fit only what the masks give this id
+    # fit only the pixels of this id in the masks; None: all pixels
     object_id: int | None = static_field(default=None, limits=Limits(0, LARGEST_WHOLE))
-    random_background: bool = static_field(default=False)  # a new colour each step behind what the masks cover
-    # of the training cameras [rad, extent]; 0 keeps their poses
+    random_background: bool = static_field(default=False)  # a new colour in each step outside of the masks
+    # of the poses of the training cameras [rad, extents]; 0 keeps them
     pose_rate: float = static_field(default=0.0, limits=Limits(0, 1e3))
-    # times the extent of the points, falls to a hundredth
+    # of the centres, times the extent of the points; decays to a hundredth
     means_rate: float = static_field(default=4e-4, limits=Limits(0, 1e3))
     scales_rate: float = static_field(default=1e-2, limits=Limits(0, 1e3))
     quats_rate: float = static_field(default=2e-3, limits=Limits(0, 1e3))
@@ -54,7 +55,7 @@ class FitConfig(eqx.Module):
     band_every: int = static_field(default=500, limits=Limits(0, LARGEST_WHOLE))
     relocate_every: int = static_field(default=100, limits=Limits(0, LARGEST_WHOLE))  # steps; 0 never moves a splat
     relocate_until: float = static_field(default=0.8, limits=Limits(0, 1))  # share of the steps
-    # of the centres, times their rate, per squared extent; 0 traces none
+    # on the centres, times their rate, per squared extent; 0 traces none
     noise: float = static_field(default=200.0, limits=Limits(0, 1e9))
     opacity_regularizer: float = static_field(default=0.002, limits=Limits(0, 1e6))
     scale_regularizer: float = static_field(default=0.002, limits=Limits(0, 1e6))  # per extent of the points
@@ -68,6 +69,10 @@ class FitConfig(eqx.Module):
         check_fields(self)
         if not isinstance(self.render, RenderConfig):
             raise InputError(f"FitConfig.render = {shown(self.render)}: must be a RenderConfig.")
+        if self.start_splats is not None and self.start_splats > self.splats:
+            raise InputError(
+                f"FitConfig.start_splats = {self.start_splats}: must not be above splats = {self.splats}, its end."
+            )
         if self.start_splats is not None and (reached := count_at(self.steps - 1, self)) < self.splats:
             raise InputError(
                 f"FitConfig.start_splats = {self.start_splats} doubles to {reached} of splats = {self.splats}"
@@ -76,14 +81,14 @@ class FitConfig(eqx.Module):
 
 
 class Photos(NamedTuple):
-    """Images of some views; with a matte they are black where it is 0."""
+    """Images of a set of views; black where their mattes are 0."""
 
     images: Float[Array, "v h w 3"]
     mattes: Float[Array, "v h w 1"] | None
 
 
 class FitState(eqx.Module):
-    """All that a resumed run needs; the random numbers follow from the step."""
+    """State of a training run, from which it can be resumed; random numbers depend on the step."""
 
     gaussians: Gaussians
     optimizer: Any
@@ -94,13 +99,18 @@ class FitState(eqx.Module):
 
 
 def count_at(step: int, config: FitConfig) -> int:
-    """Splats from this step on."""
+    """Number of splats from this step on."""
     first = config.splats if config.start_splats is None else min(config.start_splats, config.splats)
     return min(config.splats, first * 2 ** min(step // config.grow_every, 40))
 
 
 def optimizer_of(config: FitConfig, extent: float) -> optax.GradientTransformation:
-    """Adam with a rate for each kind of parameter; that of the centres falls to a hundredth."""
+    """Adam with a rate for each kind of parameter; that of the centres decays to a hundredth.
+
+    Args:
+        config: learning rates and number of steps.
+        extent: of the points [m]; the centres' rate is in units of it.
+    """
     means_rate = optax.exponential_decay(config.means_rate * extent, config.steps, 0.01)
     rates = {
         "means": means_rate,
@@ -116,26 +126,36 @@ def optimizer_of(config: FitConfig, extent: float) -> optax.GradientTransformati
 
 
 def _band_rates(step: Int[Array, ""], config: FitConfig) -> Float[Array, "k 1"]:
-    """Share of the SH rate that each coefficient gets: higher bands wait for their turn and then move slowly."""
+    """Factor on the SH rate of each coefficient: 0 until its band starts, then a twentieth above band 0."""
     band = np.floor(np.sqrt(np.arange((config.sh_degree + 1) ** 2)))
     return jnp.where(step >= band * config.band_every, np.where(band == 0, 1.0, 0.05), 0.0)[:, None]
 
 
 def noise_at(step: Int[Array, ""] | int, config: FitConfig, extent: float) -> Float[Array, ""] | float:
-    """Factor [1/m] on the covariance that shakes a centre: shakes grow with the scene as its lengths do."""
+    """Factor on the covariance that gives the noise of a centre [1/m]; noise is proportional to the scene's size."""
     rate = config.means_rate * extent * 0.01 ** (step / config.steps)
     return config.noise * rate / extent**2
 
 
 @eqx.filter_jit
 def train_steps(state: FitState, cameras: Camera, photos: Photos, config: FitConfig, optimizers, extent: float, count):
-    """`count` steps: the state after them, and their mean loss."""
+    """State after `count` steps, and their mean loss.
+
+    Args:
+        state: before.
+        cameras: training views.
+        photos: of these views.
+        config: settings.
+        optimizers: of the Gaussians and of the poses.
+        extent: of the points [m].
+        count: number of steps; an array, so that a new number does not recompile.
+    """
     views = photos.images.shape[0]
 
     def one(_, carry):
         state, total = carry
         key = jax.random.fold_in(jax.random.key(config.seed), state.step)
-        # every view once per round, in a new order each round
+        # every view once per epoch, in a new order each epoch
         order = jax.random.permutation(jax.random.fold_in(jax.random.key(config.seed + 1), state.step // views), views)
         view = order[state.step % views]
         background: Any = config.background
@@ -159,7 +179,7 @@ def train_steps(state: FitState, cameras: Camera, photos: Photos, config: FitCon
         visited = jnp.arange(views) == view
 
         def only_visited(new, old):
-            # a camera that this step did not see must not move on by its momentum
+            # the momentum must not move a camera that this step did not see
             return jnp.where(visited[:, None], new, old) if new.ndim == 2 else new
 
         poses, pose_moments = jax.tree.map(only_visited, moved, (state.poses, state.pose_optimizer))
@@ -184,13 +204,13 @@ def _loss(fitted, camera: Camera, photo: Photos, background, config: FitConfig, 
 
 
 def twist_of(poses: Float[Array, "*v 6"], extent: float) -> Float[Array, "*v 6"]:
-    """Corrections as `Camera.nudged` takes them: shifts are learnt in units of the scene."""
+    """Pose corrections as `Camera.nudged` takes them; translations are learnt in units of the extent [m]."""
     return poses * jnp.asarray([1.0, 1.0, 1.0, extent, extent, extent])
 
 
 @eqx.filter_jit
 def relocate_dead(state: FitState, config: FitConfig) -> FitState:
-    """Splats that have become transparent, moved to where others carry much; their moments are forgotten."""
+    """State with dead Gaussians relocated (`mcmc.relocate`) and the Adam moments of changed ones set to 0."""
     key = jax.random.fold_in(jax.random.key(config.seed + 2), state.step)
     gaussians, keep, moved = relocate(state.gaussians, key)
     count = len(gaussians)
@@ -205,7 +225,7 @@ def relocate_dead(state: FitState, config: FitConfig) -> FitState:
 
 
 def grow(state: FitState, count: int, config: FitConfig) -> FitState:
-    """More splats: dead ones, which relocation puts to work at once. Their moments start from zero."""
+    """State with `count` Gaussians: dead ones are added and relocated at once. Their moments start from 0."""
     old = len(state.gaussians)
 
     def longer(leaf):

@@ -1,4 +1,4 @@
-"""Scene file → plan (what this scene requires) → run."""
+"""Scene file → plan (particles, colliders, settings) → run."""
 
 from pigjax.scene.report import RunReport, StageTime
 from pigjax.scene.run import run_scene

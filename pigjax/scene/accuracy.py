@@ -8,7 +8,7 @@ Accuracy = Literal["draft", "standard", "reference"]
 
 
 class Level(NamedTuple):
-    """What a level sets where the scene file says nothing, and how it scales the file's grid spacing."""
+    """Values of a level for fields that the scene file leaves open, and its factor on the file's grid spacing."""
 
     coarsening: float  # dx is this times the file's
     defaults: dict[str, dict[str, Any]]  # by section and field
@@ -22,7 +22,7 @@ LEVELS: dict[str, Level] = {
 
 
 def with_level(values: dict[str, Any], level: str) -> dict[str, Any]:
-    """Values of a scene file with what the level sets; fields that the file gives stay."""
+    """Values of a scene file with those of the level; fields that the file gives stay."""
     filled = {**values, "accuracy": level}
     for section, fields in LEVELS[level].defaults.items():
         given = values.get(section, {})

@@ -24,7 +24,7 @@ def health_record(particles: Particles, health: Health | None, gravity: Float[np
     among them.
     """
     numbers = () if health is None else fields(Health)
-    record = {field.name: np.asarray(getattr(health, field.name)) for field in numbers}
+    record = {field.name: np.asarray(getattr(health, field.name)) for field in numbers if field.name != "sides_met"}
     x, v, mass = (np.asarray(a, np.float64) for a in (particles.x, particles.v, particles.mass))
     known = np.isfinite(x).all(1) & np.isfinite(v).all(1) & np.isfinite(mass)
     x, v, mass = x[known], v[known], mass[known]

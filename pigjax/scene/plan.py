@@ -1,4 +1,4 @@
-"""From a scene file to what will be simulated and drawn: nothing here that the scene does not ask for."""
+"""From a scene file to its particles, colliders, cameras and settings: nothing that the scene does not ask for."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Inputs:
 
 @dataclass
 class Plan:
-    """What will be simulated."""
+    """Inputs of the simulation."""
 
     particles: Particles
     table: MaterialTable
@@ -57,7 +57,7 @@ class Plan:
     config: SimConfig
     clamp: ClampParams
     frame_dt: float  # [s]
-    labels: Labels  # with what is buried in still objects given to them
+    labels: Labels  # Gaussians buried in still objects belong to these
 
 
 def read_inputs(scene: Scene) -> Inputs:
@@ -114,9 +114,10 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
             raise SceneError("input.views is missing: several objects can be told apart by masks only.")
         (only,) = inputs.ids.values()
         count = len(inputs.gaussians)
-        ids = jnp.asarray([0, only], jnp.int32)
-        return Labels(jnp.full(count, only, jnp.int32), jnp.zeros((count, 2), jnp.int32), jnp.ones(count), ids=ids)
-    views = inputs.views.subset("train") if "train" in inputs.views.splits else inputs.views
+        ids = jnp.asarray(sorted({0, only}), jnp.int32)
+        votes = jnp.zeros((count, len(ids)), jnp.int32)
+        return Labels(jnp.full(count, only, jnp.int32), votes, jnp.ones(count), ids=ids)
+    views = inputs.views.training
     assert views.masks is not None
     check_ids_occur(inputs.ids, views.masks)
     labels = lift(
@@ -237,7 +238,7 @@ def _still_solids(scene: Scene, inputs: Inputs, labels: Labels) -> dict[str, Col
 def _without_buried(inputs: Inputs, labels: Labels, solids: dict[str, Collider], dx: float) -> Labels:
     """Labels in which Gaussians deeper than a quarter of a cell in a still object belong to it.
 
-    Nobody saw what lies between an object and what it stands on, so ids there are guesses; matter that starts inside
+    No view saw the gap between an object and its support, so ids there are guesses; matter that starts inside
     a collider could only be stuck.
     """
     for name, solid in solids.items():

@@ -1,4 +1,4 @@
-"""What a run says about itself: what was modelled, sizes, times with compilation apart, health and warnings."""
+"""Report of a run: models, sizes, times with compilation apart, health and warnings."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class StageTime:
 class RunReport:
     """Result of `run_scene`, written as `report.json`."""
 
-    modelled: dict[str, Any] = field(default_factory=dict)  # what this scene made the program trace
-    sizes: dict[str, Any] = field(default_factory=dict)
-    times: dict[str, StageTime] = field(default_factory=dict)
-    health: dict[str, Any] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
-    files: dict[str, str] = field(default_factory=dict)
+    modelled: dict[str, Any] = field(default_factory=dict)  # laws, colliders, kernel, ... that the scene traced
+    sizes: dict[str, Any] = field(default_factory=dict)  # counts of Gaussians, particles, frames, substeps; mass [kg]
+    times: dict[str, StageTime] = field(default_factory=dict)  # by stage
+    health: dict[str, Any] = field(default_factory=dict)  # extremes of all frames, energies [J] by frame
+    warnings: list[str] = field(default_factory=list)  # each once
+    files: dict[str, str] = field(default_factory=dict)  # path of each result, by name
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

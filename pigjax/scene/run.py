@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,16 @@ from pigjax.core.camera import Camera
 from pigjax.core.errors import SimulationError, StaleError
 from pigjax.coupling.binding import deform
 from pigjax.mpm import Particles, vast_grid
-from pigjax.mpm.active_grid import Fit, devices_for
+from pigjax.mpm.active_grid import ActiveGrid
+from pigjax.mpm.simulate import Frame, simulate
 from pigjax.mpm.sleep import Sleeper
-from pigjax.mpm.timestep import first_substeps, frame_substeps
-from pigjax.objects.overlay import id_image, legend_sheet, overlay
+from pigjax.mpm.timestep import substep_rule
+from pigjax.objects.overlay import legend_sheet, overlay
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
 from pigjax.scene.report import RunReport
 from pigjax.scene.schema import Scene
-from pigjax.segmentation import Labels
+from pigjax.segmentation import Labels, pixel_ids
 from pigjax.splat import Gaussians, render
 
 _SHEET_FRAMES = 12
@@ -148,45 +150,54 @@ def _simulate(
     frames, particles = scene.simulation.frames, plan.particles
     present = io.readable_states(folder, signature=key)
     checkpoint = folder / "last.ckpt"
-    fit = Fit() if plan.sleep is None else Sleeper(settings=plan.sleep, body=np.asarray(particles.body))
-    # the same for a run that goes on as for one from the start
+    active = ActiveGrid() if plan.sleep is None else Sleeper(settings=plan.sleep, body=np.asarray(particles.body))
     domain = vast_grid(scene.simulation.dx)
-    steps: dict[str, Any] = {"frame_dt": plan.frame_dt, "gravity": plan.gravity, "colliders": plan.colliders}
-    config, first = first_substeps(particles, domain, plan.table, plan.config, frames=max(frames, 1), **steps)
-    saved = io.resumed(checkpoint, (np.zeros((), np.int64), particles, fit.memory()), parts=parts)
+    rule = substep_rule(
+        particles,
+        domain,
+        plan.table,
+        plan.config,
+        frames=max(frames, 1),
+        frame_dt=plan.frame_dt,
+        gravity=plan.gravity,
+        colliders=plan.colliders,
+    )
+    run = partial(
+        simulate,
+        domain=domain,
+        table=plan.table,
+        rule=rule,
+        frame_dt=plan.frame_dt,
+        gravity=plan.gravity,
+        colliders=plan.colliders,
+        contact=plan.contact,
+        active_grid=active,
+    )
+    saved = io.resumed(checkpoint, (np.zeros((), np.int64), particles, active.memory()), parts=parts)
     last = 0 if saved is None else int(saved[0])
     missing = set(range(last + 1)) - present  # of a run without a checkpoint all frames from the first are made again
     repaired = 0 if saved is None else max(missing, default=0)
     if saved is None or 0 in missing:
         _save(folder, 0, particles, health_record(particles, None, plan.gravity), key)
     if saved is None:
-        _checkpoint(checkpoint, 0, particles, fit, parts)
+        _checkpoint(checkpoint, 0, particles, active, parts)
     if repaired:
         warnings.warn(f"{folder}: states of {len(missing)} frames are missing or damaged; made again.", stacklevel=2)
-    report.modelled["integrator"] = config.integrator
-    dtype = particles.x.dtype
-    todo = [*range(1, repaired + 1), *range(last + 1, frames + 1)]
-    for frame in todo:
-        tell("simulate", frame - 1, frames)
-        if saved is not None and frame == last + 1:
-            _, particles, memory = saved
-            fit.remember(memory)
-        substeps = frame_substeps(first, particles, domain, plan.table, config, frame=frame - 1, **steps)
-        particles, _, health = fit.frame(
-            particles,
-            domain,
-            plan.table,
-            config,
-            devices_for(config, len(particles)),
-            dt=jnp.asarray(plan.frame_dt / substeps, dtype),
-            gravity=jnp.asarray(plan.gravity, dtype),
-            colliders=plan.colliders,
-            contact=plan.contact,
-            start=jnp.asarray(plan.frame_dt * (frame - 1), dtype),
-            frames=1,
-            substeps=substeps,
-        )
-        record = health_record(particles, health, plan.gravity)
+    report.modelled["integrator"] = rule.config.integrator
+
+    def todo() -> Iterator[Frame]:
+        """Frames that are missing, from the start, then those after the checkpoint."""
+        yield from run(particles, frames=range(repaired))
+        if saved is None:
+            yield from run(particles, frames=range(frames))
+        else:
+            _, resumed, memory = saved
+            active.remember(memory)
+            yield from run(resumed, frames=range(last, frames))
+
+    tell("simulate", 0 if repaired else last, frames)
+    for frame, after, _, health in todo():
+        record = health_record(after, health, plan.gravity)
         if health.is_broken():
             report.health |= summary(_records(folder, frame - 1, key) | {frame: record})
             raise SimulationError(
@@ -194,19 +205,19 @@ def _simulate(
                 f" {folder}. Lower simulation.cfl, or make matter softer or slower."
             )
         if frame > last or frame in missing:
-            _save(folder, frame, particles, record, key)
+            _save(folder, frame, after, record, key)
         if frame > last:
-            _checkpoint(checkpoint, frame, particles, fit, parts)
-    if saved is not None and last == frames:
-        fit.remember(saved[2])
+            _checkpoint(checkpoint, frame, after, active, parts)
+        if frame < frames:
+            tell("simulate", frame, frames)
     tell("simulate", frames, frames)
     records = _records(folder, frames, key)
-    most = max((int(record["substeps"]) for frame, record in records.items() if frame), default=first)
-    report.sizes |= {"substeps_per_frame": most, "last_grid": fit.shape, "resumed_from_frame": last}
+    most = max((int(record["substeps"]) for frame, record in records.items() if frame), default=rule.first)
+    report.sizes |= {"substeps_per_frame": most, "last_grid": active.shape, "resumed_from_frame": last}
     report.health |= summary(records)
     report.warnings += remarks(report.health, driven=any(collider.moves for collider in plan.colliders))
-    if isinstance(fit, Sleeper):
-        report.sizes["asleep_at_the_end"] = int(fit.asleep.sum())
+    if isinstance(active, Sleeper):
+        report.sizes["asleep_at_the_end"] = int(active.asleep.sum())
 
 
 def _records(folder: Path, frames: int, key: str) -> dict[int, Record]:
@@ -225,8 +236,8 @@ def _save(folder: Path, frame: int, particles: Particles, record: Record, key: s
     io.save_state(folder, frame, {name: np.asarray(a) for name, a in arrays.items()}, signature=key)
 
 
-def _checkpoint(path: Path, frame: int, particles: Particles, fit: Fit, parts: dict[str, str]) -> None:
-    io.save_pytree(path, (np.asarray(frame), particles, fit.memory()), parts=parts)
+def _checkpoint(path: Path, frame: int, particles: Particles, active: ActiveGrid, parts: dict[str, str]) -> None:
+    io.save_pytree(path, (np.asarray(frame), particles, active.memory()), parts=parts)
 
 
 def _draw(
@@ -265,24 +276,14 @@ def _draw(
     io.write_video(out / "video.mp4", pictures(), fps=scene.simulation.fps)
     tell("draw", frames + 1, frames + 1)
     io.write_image(out / "contact_sheet.png", io.contact_sheet(sheet))
-    _draw_objects(inputs, labels, cameras[0], background, sheet[0], out / "objects.png")
+    _draw_objects(inputs, labels, cameras[0], sheet[0], out / "objects.png")
     for name in (*_FILES, "states"):
         report.files[name.split(".")[0]] = str(out / name)
 
 
-def _draw_objects(
-    inputs: Inputs, labels: Labels, camera: Camera, background: Any, image: np.ndarray, path: Path
-) -> None:
+def _draw_objects(inputs: Inputs, labels: Labels, camera: Camera, image: np.ndarray, path: Path) -> None:
     """The first frame with its objects tinted, and the legend below."""
-    object_id = np.asarray(labels.object_id)
-    known = np.unique(np.concatenate([[0], np.maximum(object_id, 0)]))
-    # the unseen, -1, are of none
-    membership = jnp.asarray(object_id[:, None] == known, inputs.gaussians.means.dtype)
-    frame = render(
-        inputs.gaussians, camera, outputs=("object_weights",), object_weights=membership, background=background
-    )
-    assert frame.object_weights is not None
-    ids = id_image(frame.object_weights, ids=known)
+    ids, _ = pixel_ids(inputs.gaussians, labels, camera)
     names = {number: name for name, number in inputs.ids.items()}
     tinted = overlay(image, ids)
     legend = legend_sheet(names, image=image, ids=ids, width=tinted.shape[1])

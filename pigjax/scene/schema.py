@@ -1,7 +1,8 @@
-"""The scene file: what it may say, with the range of every number; errors name field, value and remedy."""
+"""The scene file: its fields, and the range of every number; errors name field, value and remedy."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
@@ -92,7 +93,7 @@ class ClampSpec(Section, frozen=True):
 
 
 class CameraSpec(Section, frozen=True):
-    """From where the video is drawn: a view of the capture, or an orbit."""
+    """Camera of the video: a view of the capture, or an orbit."""
 
     view: str | None = None  # name of a photo whose camera is taken
     target: Annotated[Triple, _PLACE] | None = None  # centre of the orbit; None: middle of the moving objects
@@ -112,7 +113,7 @@ class CameraSpec(Section, frozen=True):
 
 
 class DrawingSpec(Section, frozen=True):
-    """How exactly the video is drawn; see `RenderConfig`."""
+    """Accuracy of the video; see `RenderConfig`."""
 
     # of the video's width and height: 0.5 draws a quarter of the pixels
     scale: Annotated[float, Limits(0, 16, above=True)] = 1.0
@@ -159,7 +160,7 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
             yield "velocity", not any(self.velocity), "a fixed object does not move; remove one of the two"
 
     def to_material(self, name: str) -> Material:
-        """The material that it says.
+        """The material of these fields.
 
         Raises:
             SceneError: no material, an unknown one, or numbers out of range.
@@ -181,18 +182,18 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
 
 
 class ColliderSpec(Section, frozen=True, kw_only=True):
-    """What all colliders may say: how they touch, stand and move; the numbers of `Collider`."""
+    """Fields of all colliders: contact, pose and motion; the numbers of `Collider`."""
 
     friction: Annotated[float, _FRICTION] = 0.5
     mode: Literal["sticky", "slip", "separate"] = "separate"
     velocity: Annotated[Triple, _SPEED] | None = None
     angular_velocity: Annotated[Triple, Limits(-1e6, 1e6, unit="rad/s")] | None = None
     rotation: Annotated[tuple[float, float, float, float], _WEIGHT] | None = None  # quaternion wxyz
-    pivot: Annotated[Triple, _PLACE] | None = None  # what it turns about; None: its middle
+    pivot: Annotated[Triple, _PLACE] | None = None  # centre of its rotation; None: its middle
     shape: ClassVar[type[Collider]]
 
     def to_collider(self, where: str) -> Collider:
-        """The collider that it says.
+        """The collider of these fields.
 
         Raises:
             SceneError: a number is out of range.
@@ -246,22 +247,22 @@ class CylinderSpec(ColliderSpec, frozen=True, kw_only=True):
 
 
 class Scene(Section, frozen=True):
-    """A whole scene file."""
+    """A whole scene file, one field for each of its tables. Lengths in m, times in s, angles in degrees."""
 
-    input: InputSpec
-    simulation: SimulationSpec
-    objects: dict[str, ObjectSpec]
-    segmentation: SegmentationSpec = SegmentationSpec()
-    clamp: ClampSpec = ClampSpec()
-    camera: CameraSpec = CameraSpec()
-    drawing: DrawingSpec = DrawingSpec()
-    accuracy: Accuracy = "standard"  # sets at once what the file leaves open, and scales its dx; see `accuracy`
-    planes: dict[str, PlaneSpec] = field(default_factory=dict)
-    boxes: dict[str, BoxSpec] = field(default_factory=dict)
-    spheres: dict[str, SphereSpec] = field(default_factory=dict)
-    capsules: dict[str, CapsuleSpec] = field(default_factory=dict)
-    cylinders: dict[str, CylinderSpec] = field(default_factory=dict)
-    folder: str = "."  # set by `load_scene`; what relative paths start from
+    input: InputSpec  # files
+    simulation: SimulationSpec  # grid, frames, gravity
+    objects: dict[str, ObjectSpec]  # by name
+    segmentation: SegmentationSpec = SegmentationSpec()  # thresholds of the vote
+    clamp: ClampSpec = ClampSpec()  # bounds and weights of the eigen-clamp
+    camera: CameraSpec = CameraSpec()  # of the video
+    drawing: DrawingSpec = DrawingSpec()  # accuracy of the video
+    accuracy: Accuracy = "standard"  # sets the fields that the file leaves open, and scales its dx; see `accuracy`
+    planes: dict[str, PlaneSpec] = field(default_factory=dict)  # colliders by name
+    boxes: dict[str, BoxSpec] = field(default_factory=dict)  # colliders by name
+    spheres: dict[str, SphereSpec] = field(default_factory=dict)  # colliders by name
+    capsules: dict[str, CapsuleSpec] = field(default_factory=dict)  # colliders by name
+    cylinders: dict[str, CylinderSpec] = field(default_factory=dict)  # colliders by name
+    folder: str = "."  # set by `load_scene`; the base of relative paths
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """Something moves, and each id belongs to one object."""
@@ -278,7 +279,7 @@ class Scene(Section, frozen=True):
         return Path(self.folder) / name
 
     def colliders(self) -> tuple[Collider, ...]:
-        """Those that it describes by numbers.
+        """The colliders of the file, from `planes` to `cylinders`.
 
         Raises:
             SceneError: a number is out of range.
@@ -318,7 +319,7 @@ def read_file(path: Path, what: str) -> dict[str, Any]:
         MissingFileError: there is no such file.
         SceneError: it is not TOML.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):  # False, too, where no file can have the path
         raise MissingFileError(f"{path}: {what} does not exist; check the path.")
     try:
         return io.read_toml(path)
@@ -331,7 +332,7 @@ def scene_from(
 ) -> Scene:
     """A scene from plain values, as TOML gives them, checked.
 
-    The scene holds what `accuracy` (or the values' own) makes of them: its `simulation.dx` is the one of that level.
+    The values of the level `accuracy` (or the file's own) are applied: `simulation.dx` is the spacing of that level.
 
     Raises:
         SceneError: as `load_scene`.

@@ -1,1 +1,1 @@
-"""Rasterization of Gaussian splats: projection, binning into tiles, compositing, contributions."""
+"""Rasterization of Gaussian splats: projection, spherical harmonics, binning into tiles, compositing, contributions."""

@@ -1,8 +1,9 @@
-"""Which splats each tile blends, front to back, built in passes of a static size.
+"""Binning: the splats that each tile composites, front to back, listed in passes of a static size.
 
-Splats are ordered by depth once. A pass takes the next of them, as many as its box/tile pairs have slots, leaves out
-tiles that are opaque already, and sorts the pairs by (tile, depth). Passes go on until every splat was taken or every
-tile is opaque: nothing is ever dropped, memory does not grow with the pairs, and what is hidden is hardly ever listed.
+Splats are sorted by depth once (`bin_splats`). A pass (`list_pass`) takes the next of them, as many as its slots hold
+splat/tile pairs, leaves out tiles that are opaque already, and sorts the pairs by (tile, depth). Passes go on until
+every splat was taken or every tile is opaque. So nothing is dropped, memory does not grow with the number of pairs, and
+few hidden splats are listed. 3DGS lists all pairs at once (Kerbl et al. 2023, appendix C), which needs a capacity.
 """
 
 from __future__ import annotations
@@ -18,48 +19,30 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.arrays import static_field
 from pigjax.core.camera import Camera
-from pigjax.splatting.types import RenderConfig
+from pigjax.splatting.types import Projected, RenderConfig
 
-SHAPE_COLUMNS = 6  # of a splat's row: x, y, conic xx xy yy, log opacity; features follow
+SHAPE_COLUMNS = 6  # of a splat's row: x, y, conic xx, xy, yy, log opacity; features follow
 _KEY_LIMIT = 2**31  # tile and slot share one int32 sort key below it
 _DEPTH_BITS = 30  # of float32 above the near plane: 128 octaves
 
 
-class Projected(eqx.Module):
-    """Splats on the image plane."""
-
-    centres: Float[Array, "n 2"]  # [px]
-    conics: Float[Array, "n 3"]  # inverse 2D covariance, entries xx, xy, yy [1/px²]
-    opacities: Float[Array, "n"]
-    depths: Float[Array, "n"]  # camera z [m]
-    radii: Float[Array, "n 2"]  # half extents of the box outside which alpha < alpha_min [px]
-    visible: Bool[Array, "n"]
-
-    @property
-    def shapes(self) -> Float[Array, "n 6"]:
-        """Columns that every tile needs of a splat."""
-        there = self.opacities > 0
-        peaks = jnp.where(there, jnp.log(jnp.where(there, self.opacities, 1.0)), -jnp.inf)
-        return jnp.concatenate([self.centres, self.conics, peaks[:, None]], 1)
-
-
 class BlendConfig(eqx.Module):
-    """What listing and blending need to know at trace time."""
+    """Static settings of binning and compositing: image, tiles, sizes of loops, thresholds."""
 
-    width: int = static_field()
-    height: int = static_field()
-    tile: int = static_field()
-    chunk: int = static_field()
-    slots: int = static_field()  # box/tile pairs sorted in one pass
-    capacity: int | None = static_field()  # box/tile pairs listed for an image or band, None for all that are seen
-    tiles_at_once: int = static_field()
-    by_products: bool = static_field()  # a chunk's running products and sums as matrix products, not splat by splat
-    bands: int = static_field()  # devices that share the image
+    width: int = static_field()  # [px]
+    height: int = static_field()  # [px]
+    tile: int = static_field()  # edge of a tile [px]
+    chunk: int = static_field()  # splats composited before a tile is tested for being opaque
+    slots: int = static_field()  # splat/tile pairs sorted in one pass
+    capacity: int | None = static_field()  # splat/tile pairs listed for an image or shard; None: unlimited
+    tiles_at_once: int = static_field()  # tiles composited in one vectorised loop
+    by_products: bool = static_field()  # running products and sums of a chunk as matrix products, not splat by splat
+    shards: int = static_field()  # devices that share the image
     alpha_min: float = static_field()
     alpha_max: float = static_field()
     transmittance_min: float = static_field()
-    near: float = static_field()
-    surface: bool = static_field()  # also return the depth at which transmittance falls below a threshold
+    near: float = static_field()  # [m]
+    surface: bool = static_field()  # also return the depth at which the transmittance falls below a threshold
 
     @property
     def columns(self) -> int:
@@ -78,30 +61,37 @@ class BlendConfig(eqx.Module):
 
 
 class Boxes(eqx.Module):
-    """Splats front to back with the box of tiles that each may touch; none for invisible ones."""
+    """Splats front to back, each with the box of tiles that it may touch; the box of an invisible splat is empty."""
 
-    order: Int[Array, "n"]  # splat at each rank
+    order: Int[Array, "n"]  # splat at each depth rank
     low: Int[Array, "n 2"]  # first column and row of tiles
     size: Int[Array, "n 2"]  # number of columns and rows
 
 
 class TileLists(eqx.Module):
-    """One pass: tile t blends the splats of rank `rank[start[t]:start[t + 1]]`, front to back."""
+    """The lists of one pass: tile t composites the splats of rank `rank[start[t]:start[t + 1]]`, front to back."""
 
     rank: Int[Array, "slots"]
-    tile: Int[Array, "slots"]  # number of tiles in slots that no tile owns
+    tile: Int[Array, "slots"]  # equals the number of tiles in slots that no tile owns
     start: Int[Array, "tiles_plus_1"]
-    next: Int[Array, ""]  # first rank that is not in this pass
-    listed: Int[Array, ""]  # box/tile pairs of this pass
+    next: Int[Array, ""]  # first rank after this pass
+    listed: Int[Array, ""]  # splat/tile pairs of this pass
 
 
-def bands_of(camera: Camera, config: RenderConfig) -> int:
-    """Devices that share an image: no more than it has rows of tiles."""
+def shards_of(camera: Camera, config: RenderConfig) -> int:
+    """Number of devices that share an image: `config.bands`, but at most the number of rows of tiles."""
     return min(config.bands, -(-camera.height // config.tile_size))
 
 
 def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: bool) -> BlendConfig:
-    """What listing and blending need of the camera, the number of splats and the settings."""
+    """Static settings of one drawing.
+
+    Args:
+        camera: gives the size of the image.
+        config: the user's settings.
+        count: number of splats.
+        surface: whether the surface depth is wanted.
+    """
     on_cpu = jax.default_backend() == "cpu"
     tiles = -(-camera.width // config.tile_size) * -(-camera.height // config.tile_size)
     chunk = 64 if 6 * count > 32 * tiles else 16
@@ -115,7 +105,7 @@ def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: b
         capacity=config.capacity,
         tiles_at_once=config.tiles_at_once or (1 if on_cpu else 2048),
         by_products=not on_cpu,
-        bands=bands_of(camera, config),
+        shards=shards_of(camera, config),
         alpha_min=config.alpha_min,
         alpha_max=config.alpha_max,
         transmittance_min=config.transmittance_min,
@@ -125,26 +115,53 @@ def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: b
 
 
 def slots_of(count: int, tiles: int, capacity: int | None, limit: int) -> int:
-    """Static size of a pass: 6 pairs per splat up to `limit` and to what one sort key holds.
+    """Static size of a pass: 6 pairs per splat, at most `limit` and the capacity, and at least the number of tiles.
 
-    A splat that covers every tile has to fit whatever that says.
+    A splat that covers every tile has to fit into one pass. The last bound keeps (tile, slot) within one sort key.
     """
     return max(tiles, min(6 * count, limit, capacity or limit, (_KEY_LIMIT - 1) // (tiles + 1)))
 
 
-def front_to_back(projected: Projected, config: BlendConfig) -> Boxes:
-    """Splats by depth, equal depths by index, invisible ones last."""
+def bin_splats(projected: Projected, config: BlendConfig) -> Boxes:
+    """Depth order of the splats and their boxes of tiles: equal depths by index, invisible splats last.
+
+    Nothing here is differentiated.
+    """
+    projected = lax.stop_gradient(projected)
     order = _depth_order(projected, config.near)
     low, size = tile_boxes(projected, config)
     return Boxes(order, low[order], size[order])
 
 
 def tile_boxes(projected: Projected, config: BlendConfig) -> tuple[Int[Array, "n 2"], Int[Array, "n 2"]]:
-    """First tile and number of tiles, along x and y, of each splat's bounding box; no tiles for invisible splats."""
+    """First tile, and number of tiles along x and y, of each splat's bounding box; invisible splats have no tiles."""
     limit = jnp.array([config.columns, config.rows], projected.centres.dtype)
     low = jnp.clip(jnp.floor((projected.centres - projected.radii) / config.tile), 0, limit).astype(jnp.int32)
     high = jnp.clip(jnp.floor((projected.centres + projected.radii) / config.tile) + 1, 0, limit).astype(jnp.int32)
     return low, jnp.where(projected.visible[:, None], jnp.maximum(high - low, 0), 0)
+
+
+def rows_in_order(projected: Projected, features: Float[Array, "n c"], boxes: Boxes) -> Float[Array, "n f"]:
+    """Rows that tiles composite, front to back: shape columns, then features."""
+    return jnp.concatenate([projected.shapes, features], 1)[boxes.order]
+
+
+def untile(planes: Float[Array, "tiles c pixels"], config: BlendConfig) -> Float[Array, "h w c"]:
+    """Image from planes of tiles, without the pixels of the last tiles beyond its edge.
+
+    Shards may append rows of tiles, so `tiles` may exceed `config.tiles`.
+    """
+    channels = planes.shape[1]
+    image = planes.reshape(-1, config.columns, channels, config.tile, config.tile).transpose(0, 3, 1, 4, 2)
+    image = image.reshape(-1, config.columns * config.tile, channels)
+    return image[: config.height, : config.width]
+
+
+def into_tiles(image: Int[Array, "h w"], fill: int, config: BlendConfig) -> Int[Array, "tiles pixels"]:
+    """Pixels of each tile; those beyond the edge of the image are `fill`."""
+    padded = jnp.pad(image, [(0, -size % config.tile) for size in image.shape], constant_values=fill)
+    tiled = padded.reshape(-1, config.tile, config.columns, config.tile).transpose(0, 2, 1, 3)
+    return tiled.reshape(config.tiles, -1)
 
 
 def list_pass(
@@ -156,10 +173,19 @@ def list_pass(
     slots: int,
     budget: Int[Array, ""] | int | None = None,
 ) -> TileLists:
-    """Lists of the splats from rank `first` on whose pairs fit into the slots (and the budget).
+    """Lists of one pass: the splats from rank `first` on, as many as have pairs that fit.
 
-    `shapes` are in the order of the boxes. A splat without an open tile in its box takes no slots; pairs with closed
-    tiles, or in which the splat cannot reach alpha_min, are culled exactly.
+    A splat without an open tile in its box takes no slots. Pairs with opaque tiles, and pairs in which the splat's
+    alpha is below alpha_min on the whole tile, are culled exactly.
+
+    Args:
+        shapes: shape columns, front to back.
+        boxes: of all splats.
+        first: depth rank at which the pass starts.
+        open_tiles: tiles that are not opaque yet; None: all.
+        config: static settings.
+        slots: splat/tile pairs that the pass holds.
+        budget: pairs left of the capacity; None: unlimited.
     """
     ranks = jnp.arange(shapes.shape[0], dtype=jnp.int32)
     pairs = jnp.where(ranks >= first, pairs_in_open_tiles(boxes, open_tiles, config), 0)
@@ -193,7 +219,7 @@ def list_pass(
 
 
 def pairs_in_open_tiles(boxes: Boxes, open_tiles: Bool[Array, "tiles"] | None, config: BlendConfig) -> Int[Array, "n"]:
-    """Tiles in each splat's box, 0 if none of them is open."""
+    """Number of tiles in each splat's box, 0 if none of them is open; None means that all are."""
     pairs = boxes.size[:, 0] * boxes.size[:, 1]
     if open_tiles is None:
         return pairs
@@ -212,7 +238,7 @@ def pairs_in_open_tiles(boxes: Boxes, open_tiles: Bool[Array, "tiles"] | None, c
 
 
 def count_pairs(pairs: Int[Array, "n"]) -> Int[Array, ""]:
-    """Sum that stops at the largest integer instead of wrapping."""
+    """Sum of the pairs, held at the largest int32 where it would wrap."""
     wraps = jnp.sum(pairs, dtype=jnp.float32) > 2.0**31 - 2**20
     return jnp.where(wraps, 2**31 - 1, jnp.sum(pairs, dtype=jnp.int32))
 
@@ -220,8 +246,8 @@ def count_pairs(pairs: Int[Array, "n"]) -> Int[Array, ""]:
 def _depth_order(projected: Projected, near: float) -> Int[Array, "n"]:
     """Stable order by depth, invisible splats last.
 
-    A sort of one integer operand is several times as fast as an argsort, so the bits of the depth are sorted in digits
-    that share a 32-bit key with the index.
+    A radix sort: a sort of one integer operand is several times as fast as an argsort, so the bits of the depth are
+    sorted digit by digit, each digit in one 32-bit key with the index.
     """
     depths, count = projected.depths, projected.depths.shape[0]
     index_bits = max(count - 1, 1).bit_length()
@@ -238,8 +264,14 @@ def _depth_order(projected: Projected, near: float) -> Int[Array, "n"]:
     return order.astype(jnp.int32)
 
 
-def _reaches(shapes, left, top, config: BlendConfig) -> Bool[Array, "slots"]:
-    """Whether a splat's largest alpha on a tile's pixel centres, at its conic's minimum there, is worth blending."""
+def _reaches(
+    shapes: Float[Array, "slots 6"], left: Int[Array, "slots"], top: Int[Array, "slots"], config: BlendConfig
+) -> Bool[Array, "slots"]:
+    """Whether a splat has alpha >= alpha_min anywhere on a tile, whose corner is at `left`, `top` [px].
+
+    The largest alpha is where the conic's quadratic form is least on the rectangle of the pixel centres: at the centre
+    if that lies inside, else on an edge.
+    """
     x, y, a, b, c, peak = shapes.T
     x0, y0 = left + 0.5 - x, top + 0.5 - y
     x1, y1 = x0 + (config.tile - 1), y0 + (config.tile - 1)

@@ -1,19 +1,17 @@
-"""The tile compositor under `splat.render`: splats blended front to back, tile by tile.
+"""The tile compositor under `splat.render`: splats rasterized tile by tile, blended front to back.
 
-Each pass of `lists.list_pass` is blended on top of what the passes before it left. A tile walks its list in chunks and
-leaves as soon as all its pixels are opaque, so time grows with the pairs that are seen, and memory with splats, pixels
-and the slots of one pass, never with pixels x splats. The backward pass walks the same way, front to back: with the
-pixel's total known from the forward pass, what lies behind a splat is total minus prefix, so nothing is stored.
-
-Opacity is tracked as the plain product of all (1 - alpha), which falls below `transmittance_min` at the splat that
-closes a pixel and stays there; a splat counts only if the product is above it afterwards. That equals closing the pixel
-for good, without a flag.
+Each pass of `binning.list_pass` is composited on top of the passes before it. A tile walks its list in chunks and stops
+when all its pixels are opaque. So time grows with the splat/tile pairs that are seen, and memory with splats, pixels
+and the slots of one pass, never with pixels x splats. The backward pass walks the same lists front to back: the sum of
+the splats behind one is the pixel's total, known from the forward pass, minus the running sum, so nothing is stored.
+The blending rule itself is in `alpha`.
 """
 
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,65 +20,194 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from pigjax.core.arrays import matmul
-from pigjax.splatting.alpha import TERMS, as_tiles_see, blend_chunk, crossing, monomials, running_sums, tile_alphas
+from pigjax.splatting.alpha import (
+    TERMS,
+    blend_chunk,
+    crossing,
+    monomials,
+    running_sums,
+    sum_channels,
+    tile_alphas,
+    tile_polynomials,
+)
 from pigjax.splatting.binning import (
     SHAPE_COLUMNS,
     BlendConfig,
     Boxes,
-    Projected,
+    TileLists,
     count_pairs,
-    front_to_back,
     list_pass,
     pairs_in_open_tiles,
+    rows_in_order,
+    untile,
 )
-from pigjax.splatting.scan_compositor import all_chunks, walk
-from pigjax.splatting.sharding import in_bands
+from pigjax.splatting.scan_compositor import composite_by_scan
+from pigjax.splatting.sharding import shard_rows
+from pigjax.splatting.types import Projected
+
+State = tuple[Float[Array, "..."], ...]  # of a loop over lists: planes of each tile, the transmittance first
 
 
 class Blended(NamedTuple):
-    """What `blend` returns."""
+    """The image of `composite`."""
 
-    alpha: Float[Array, "h w"]
+    alpha: Float[Array, "h w"]  # sum of alpha·T
     features: Float[Array, "h w c"]  # sums of features weighted by alpha·T
-    surface: Float[Array, "h w"] | None  # depth [m] of the splat that takes transmittance below tau, 0 for none
-    overflow: Int[Array, ""]  # box/tile pairs beyond the capacity, far splats dropped first
+    surface: Float[Array, "h w"] | None  # depth of the splat that takes the transmittance below tau [m], 0 for none
+    overflow: Int[Array, ""]  # splat/tile pairs beyond the capacity, far splats dropped first
 
 
-def blend(
+def composite(
     projected: Projected,
     features: Float[Array, "n c"],
+    boxes: Boxes,
     config: BlendConfig,
     tau: Float[Array, ""] | float = 0.5,
     *,
     reverse: bool = True,
 ) -> Blended:
-    """Blend features front to back.
+    """Composite features front to back (Kerbl et al. 2023, equation 3).
 
     Args:
         projected: splats on the image plane.
-        features: what is summed with weight alpha·T, any number of channels.
+        features: summed with weight alpha·T, any number of channels.
+        boxes: of `binning.bin_splats`.
         config: image size, thresholds and static sizes.
         tau: transmittance below which a pixel's surface lies; its derivative is zero.
-        reverse: use the hand-written backward pass; False blends by a plain scan over lists of a static capacity, which
-            every mode and order of differentiation goes through.
+        reverse: use the compositor with the hand-written backward pass; False uses `composite_by_scan`, which every
+            mode and order of differentiation goes through.
     """
-    boxes = front_to_back(lax.stop_gradient(projected), config)
     extra = [projected.depths[:, None]] if config.surface else []
     ones = jnp.ones_like(projected.depths)[:, None]
-    table = jnp.concatenate([projected.shapes, features, ones, *extra], 1)[boxes.order]
+    table = rows_in_order(projected, jnp.concatenate([features, ones, *extra], 1), boxes)
     tau = lax.stop_gradient(jnp.asarray(tau, table.dtype))
-    composite = _composite if reverse else _by_scan
-    planes, overflow = (composite if config.bands == 1 else in_bands(composite))(table, boxes, tau, config)
-    image = planes.reshape(-1, config.columns, planes.shape[1], config.tile, config.tile).transpose(0, 3, 1, 4, 2)
-    image = image.reshape(-1, config.columns * config.tile, planes.shape[1])
-    image, channels = image[: config.height, : config.width], features.shape[1]
+    of_tiles = composite_tiles if reverse else composite_by_scan
+    planes, overflow = (of_tiles if config.shards == 1 else shard_rows(of_tiles))(table, boxes, tau, config)
+    image, channels = untile(planes, config), features.shape[1]
     return Blended(image[..., channels], image[..., :channels], image[..., -1] if config.surface else None, overflow)
 
 
-def _passes(table, boxes: Boxes, config: BlendConfig, state, visit):
-    """Run `visit(lists, state)` for one pass after the other; the first plane of the state is the transmittance.
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
+def composite_tiles(
+    table: Float[Array, "n f"], boxes: Boxes, tau: Float[Array, ""], config: BlendConfig
+) -> tuple[Float[Array, "tiles c p"], Int[Array, ""]]:
+    """Planes of each tile: features, alpha and, with `config.surface`, the surface depth.
 
-    Returns the last state and the box/tile pairs that a given capacity left out.
+    Reverse mode costs about one more walk over the lists and stores the planes alone; there is no forward mode and no
+    second derivative (`composite_by_scan` has both).
+
+    Args:
+        table: rows of `binning.rows_in_order`: shape columns, features, ones, and depths if the surface is wanted.
+        boxes: of `binning.bin_splats`.
+        tau: transmittance below which the surface lies.
+        config: static settings.
+
+    Returns:
+        The planes, and the splat/tile pairs that the capacity left out.
+    """
+    return _forward(table, boxes, tau, config)
+
+
+def _forward(
+    table: Float[Array, "n f"], boxes: Boxes, tau: Float[Array, ""], config: BlendConfig
+) -> tuple[Float[Array, "tiles c p"], Int[Array, ""]]:
+    pixels, dtype, groups = config.tile**2, table.dtype, _tile_groups(config)
+    channels = table.shape[1] - SHAPE_COLUMNS
+
+    def composite_chunk(rows, valid, transmittance, planes):
+        alpha, _ = tile_alphas(rows, valid, config)
+        blend = blend_chunk(alpha, transmittance, config)
+        return blend.behind, planes + sum_channels(rows, alpha, blend, tau, config)
+
+    def composite_pass(lists, state):
+        rows = _rows_of_lists(table, lists, config)
+
+        def composite_group(group):
+            tiles, *state = group
+
+            def visit_chunk(chunk, _, valid, state):
+                return jax.vmap(composite_chunk)(chunk, valid, *state)
+
+            return _walk_lists(rows, lists, tiles, tuple(state), visit_chunk, config)
+
+        state = lax.map(composite_group, (groups, *(_grouped(planes, groups) for planes in state)))
+        return tuple(_ungrouped(planes, config) for planes in state)
+
+    start = jnp.ones((config.tiles, pixels), dtype), jnp.zeros((config.tiles, channels, pixels), dtype)
+    (_, planes), overflow = _run_passes(table, boxes, config, start, composite_pass)
+    return planes, overflow
+
+
+def _composite_fwd(table: Float[Array, "n f"], boxes: Boxes, tau: Float[Array, ""], config: BlendConfig) -> Any:
+    planes, overflow = _forward(table, boxes, tau, config)
+    return (planes, overflow), (table, boxes, tau, planes)
+
+
+def _composite_bwd(config: BlendConfig, saved: Any, cotangents: Any) -> tuple[Float[Array, "n f"], Any, Any]:
+    """Cotangent of the table.
+
+    Let g be the cotangent of a splat's weight alpha·T. Then d loss / d alpha = T g - S / (1 - alpha), where S is the
+    sum of weight·g over the splats behind it: the pixel's total minus the running sum.
+    """
+    table, boxes, tau, planes = saved
+    cotangent = cotangents[0]
+    pixels, dtype, groups = config.tile**2, table.dtype, _tile_groups(config)
+    blended = table.shape[1] - SHAPE_COLUMNS - config.surface  # the surface is picked, not blended
+    totals = jnp.sum((planes * cotangent)[:, :blended], axis=1)
+    pixel_terms = monomials(config, dtype)
+
+    def chunk_cotangent(rows, valid, transmittance, prefix, total, cotangent):
+        alpha, unclamped = tile_alphas(rows, valid, config)
+        gain = matmul(rows[:, TERMS : TERMS + blended], cotangent[:blended])
+
+        blend = blend_chunk(alpha, transmittance, config)
+        prefix = running_sums(prefix, blend.weight * gain, config)
+        slope = blend.weight * gain - (total - prefix) * (alpha / (1 - alpha))
+        slope = jnp.where((blend.weight > 0) & (unclamped < config.alpha_max), slope, 0.0)
+        # the exponent is linear in its coefficients, so their cotangents are moments of the pixel grid
+        columns = [matmul(slope, pixel_terms.T), matmul(blend.weight, cotangent[:blended].T)]
+        if config.surface:
+            columns.append(matmul(crossing(alpha, blend, tau, config).astype(dtype), cotangent[blended:].T))
+        return blend.behind, prefix[-1], jnp.concatenate(columns, 1)
+
+    def pass_cotangent(lists, state):
+        *state, of_table = state
+        rows, rows_vjp = jax.vjp(lambda table: _rows_of_lists(table, lists, config), table)
+
+        def group_cotangent(of_rows, group):
+            tiles, total, cotangent, *state = group
+
+            def visit_chunk(chunk, slot, valid, state):
+                transmittance, prefix, of_rows = state
+                *state, change = jax.vmap(chunk_cotangent)(chunk, valid, transmittance, prefix, total, cotangent)
+                return *state, of_rows.at[slot.ravel()].add(change.reshape(-1, change.shape[-1]))
+
+            *state, of_rows = _walk_lists(rows, lists, tiles, (*state, of_rows), visit_chunk, config)
+            return of_rows, tuple(state)
+
+        per_tile = (totals, cotangent, *state)
+        of_rows, state = lax.scan(
+            group_cotangent, jnp.zeros_like(rows), (groups, *(_grouped(planes, groups) for planes in per_tile))
+        )
+        return *(_ungrouped(planes, config) for planes in state), of_table + rows_vjp(of_rows)[0]
+
+    # transmittance and running sum of each pixel, and the cotangent of the table
+    start = (jnp.ones((config.tiles, pixels), dtype), jnp.zeros((config.tiles, pixels), dtype), jnp.zeros_like(table))
+    (*_, of_table), _ = _run_passes(table, boxes, config, start, pass_cotangent)
+    no_cotangent = jax.tree.map(lambda index: np.zeros(index.shape, jax.dtypes.float0), boxes)
+    return of_table, no_cotangent, jnp.zeros_like(tau)
+
+
+composite_tiles.defvjp(_composite_fwd, _composite_bwd)
+
+
+def _run_passes(
+    table: Float[Array, "n f"], boxes: Boxes, config: BlendConfig, state: State, visit: Callable
+) -> tuple[State, Int[Array, ""]]:
+    """Run `visit(lists, state)` for one pass after the other; the state starts with the transmittance of each tile.
+
+    Returns:
+        The last state, and the splat/tile pairs that the capacity left out.
     """
     shapes = lax.stop_gradient(table[:, :SHAPE_COLUMNS])
     count = shapes.shape[0]
@@ -95,7 +222,8 @@ def _passes(table, boxes: Boxes, config: BlendConfig, state, visit):
     def one(carry):
         first, listed, _, state = carry
         budget = None if config.capacity is None else config.capacity - listed
-        lists = list_pass(shapes, boxes, first, open_tiles(state), config, config.slots, budget)
+        with jax.named_scope("bin"):
+            lists = list_pass(shapes, boxes, first, open_tiles(state), config, config.slots, budget)
         return lists.next, listed + lists.listed, lists.listed, visit(lists, state)
 
     zero = jnp.zeros((), jnp.int32)
@@ -106,11 +234,18 @@ def _passes(table, boxes: Boxes, config: BlendConfig, state, visit):
     return state, count_pairs(left)
 
 
-def _walk(rows, lists, tiles, state, visit, config: BlendConfig):
-    """Chunk after chunk of the lists of a group of tiles [b], until all are through or opaque.
+def _walk_lists(
+    rows: Float[Array, "s f"],
+    lists: TileLists,
+    tiles: Int[Array, "b"],
+    state: State,
+    visit: Callable,
+    config: BlendConfig,
+) -> State:
+    """Chunk after chunk of the lists of a group of tiles, until all lists end or all pixels are opaque.
 
-    `visit(chunk, slot, valid, state)` gets the next rows of each tile, and the slot that each came from; the state
-    starts with the transmittance.
+    `visit(chunk, slot, valid, state)` gets the next rows of each tile [b k f], and the slot that each came from; the
+    state starts with the transmittance.
     """
     bounds = jnp.append(lists.start, lists.start[-1])
     end, offsets = bounds[tiles + 1], jnp.arange(config.chunk)
@@ -128,138 +263,26 @@ def _walk(rows, lists, tiles, state, visit, config: BlendConfig):
     return lax.while_loop(unfinished, one, (bounds[tiles], state))[1]
 
 
-def _in_list_order(table, lists, config: BlendConfig):
-    """Rows as the lists have them, padded so that the last chunk may read past the end."""
+def _rows_of_lists(table: Float[Array, "n f"], lists: TileLists, config: BlendConfig) -> Float[Array, "s f"]:
+    """Row of each slot of the lists, padded by a chunk, so that the last chunk may read past the end."""
     owned = (lists.tile < config.tiles)[:, None]
     # a slot that no tile owns may hold a splat that is not finite
-    rows = as_tiles_see(jnp.where(owned, table[lists.rank], 0.0), lists.tile, config)
+    rows = tile_polynomials(jnp.where(owned, table[lists.rank], 0.0), lists.tile, config)
     return jnp.pad(rows, ((0, config.chunk), (0, 0)))
 
 
-def _groups(config: BlendConfig):
-    """Tiles [g b] that are walked together; the last group is filled up with a tile beyond the last, without a list."""
+def _tile_groups(config: BlendConfig) -> Int[Array, "g b"]:
+    """Tiles that are walked together; the last group is filled up with a tile beyond the last, whose list is empty."""
     together = min(config.tiles_at_once, config.tiles)
     tiles = jnp.arange(-(-config.tiles // together) * together, dtype=jnp.int32)
     return jnp.minimum(tiles, config.tiles).reshape(-1, together)
 
 
-def _grouped(planes, groups):
-    """Planes [tiles ...] as [g b ...]."""
+def _grouped(planes: Float[Array, "tiles *p"], groups: Int[Array, "g b"]) -> Float[Array, "g b *p"]:
     short = groups.size - planes.shape[0]
     padded = jnp.pad(planes, [(0, short)] + [(0, 0)] * (planes.ndim - 1)) if short else planes
     return padded.reshape(*groups.shape, *planes.shape[1:])
 
 
-def _ungrouped(planes, config: BlendConfig):
+def _ungrouped(planes: Float[Array, "g b *p"], config: BlendConfig) -> Float[Array, "tiles *p"]:
     return planes.reshape(-1, *planes.shape[2:])[: config.tiles]
-
-
-def _forward(table, boxes: Boxes, tau, config: BlendConfig):
-    """Planes [tiles, features + alpha (+ surface), pixels], and what the capacity left out."""
-    pixels, dtype, groups = config.tile**2, table.dtype, _groups(config)
-    channels = table.shape[1] - SHAPE_COLUMNS
-
-    def one_tile(rows, valid, through, planes):
-        alpha, _ = tile_alphas(rows, valid, config)
-        before, weight, behind = blend_chunk(alpha, through, config)
-        values = rows[:, TERMS:].T
-        if not config.surface:
-            return behind, planes + matmul(values, weight)
-        picked = matmul(values[-1:], crossing(before, alpha, tau, config).astype(dtype))
-        return behind, planes + jnp.concatenate([matmul(values[:-1], weight), picked])
-
-    def visit(lists, state):
-        rows = _in_list_order(table, lists, config)
-
-        def blend_group(group):
-            tiles, *state = group
-
-            def visit_chunk(chunk, _, valid, state):
-                return jax.vmap(one_tile)(chunk, valid, *state)
-
-            return _walk(rows, lists, tiles, tuple(state), visit_chunk, config)
-
-        moved = lax.map(blend_group, (groups, *(_grouped(planes, groups) for planes in state)))
-        return tuple(_ungrouped(planes, config) for planes in moved)
-
-    start = jnp.ones((config.tiles, pixels), dtype), jnp.zeros((config.tiles, channels, pixels), dtype)
-    (_, planes), overflow = _passes(table, boxes, config, start, visit)
-    return planes, overflow
-
-
-def _by_scan(table, boxes: Boxes, tau, config: BlendConfig):
-    """As `_forward`, without a loop whose length depends on the data."""
-    chunks, overflow = all_chunks(table, boxes, config)
-
-    def visit(chunk, alpha, before, after):
-        weight = jnp.where(after > config.transmittance_min, alpha * before, 0.0)
-        values = chunk.rows[:, TERMS:].T
-        if not config.surface:
-            return matmul(values, weight)
-        picked = matmul(values[-1:], crossing(before, alpha, tau, config).astype(table.dtype))
-        return jnp.concatenate([matmul(values[:-1], weight), picked])
-
-    parts = walk(chunks, jnp.any(chunks.valid, 1), config, visit)
-    return jax.ops.segment_sum(parts, chunks.tile, config.tiles), overflow
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
-def _composite(table, boxes: Boxes, tau, config: BlendConfig):
-    return _forward(table, boxes, tau, config)
-
-
-def _composite_fwd(table, boxes: Boxes, tau, config: BlendConfig):
-    planes, overflow = _forward(table, boxes, tau, config)
-    return (planes, overflow), (table, boxes, tau, planes)
-
-
-def _composite_bwd(config: BlendConfig, saved, cotangents):
-    table, boxes, tau, planes = saved
-    cotangent = cotangents[0]
-    pixels, dtype, groups = config.tile**2, table.dtype, _groups(config)
-    blended = table.shape[1] - SHAPE_COLUMNS - config.surface  # the surface is picked, not blended
-    totals = jnp.sum((planes * cotangent)[:, :blended], axis=1)
-    pixel_terms = monomials(config, dtype)
-
-    def walk_chunk(rows, valid, through, prefix, total, towards):
-        alpha, unclamped = tile_alphas(rows, valid, config)
-        gain = matmul(rows[:, TERMS : TERMS + blended], towards[:blended])
-
-        before, weight, behind = blend_chunk(alpha, through, config)
-        prefix = running_sums(prefix, weight * gain, config)
-        slope = weight * gain - (total - prefix) * (alpha / (1 - alpha))
-        slope = jnp.where((weight > 0) & (unclamped < config.alpha_max), slope, 0.0)
-        # the exponent is linear in its coefficients, so their gradients are moments of the pixel grid
-        columns = [matmul(slope, pixel_terms.T), matmul(weight, towards[:blended].T)]
-        if config.surface:
-            columns.append(matmul(crossing(before, alpha, tau, config).astype(dtype), towards[blended:].T))
-        return behind, prefix[-1], jnp.concatenate(columns, 1)
-
-    def visit(lists, state):
-        *state, gradient = state
-        rows, pull_back = jax.vjp(lambda table: _in_list_order(table, lists, config), table)
-
-        def walk_group(of_rows, group):
-            tiles, total, towards, *state = group
-
-            def visit_chunk(chunk, slot, valid, state):
-                through, prefix, of_rows = state
-                *state, change = jax.vmap(walk_chunk)(chunk, valid, through, prefix, total, towards)
-                return *state, of_rows.at[slot.ravel()].add(change.reshape(-1, change.shape[-1]))
-
-            *state, of_rows = _walk(rows, lists, tiles, (*state, of_rows), visit_chunk, config)
-            return of_rows, tuple(state)
-
-        per_tile = (totals, cotangent, *state)
-        of_rows, moved = lax.scan(
-            walk_group, jnp.zeros_like(rows), (groups, *(_grouped(planes, groups) for planes in per_tile))
-        )
-        return *(_ungrouped(planes, config) for planes in moved), gradient + pull_back(of_rows)[0]
-
-    planes_of = (jnp.ones((config.tiles, pixels), dtype), jnp.zeros((config.tiles, pixels), dtype))
-    (*_, gradient), _ = _passes(table, boxes, config, (*planes_of, jnp.zeros_like(table)), visit)
-    no_gradient = jax.tree.map(lambda index: np.zeros(index.shape, jax.dtypes.float0), boxes)
-    return gradient, no_gradient, jnp.zeros_like(tau)
-
-
-_composite.defvjp(_composite_fwd, _composite_bwd)

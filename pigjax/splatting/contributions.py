@@ -1,21 +1,21 @@
-"""What voting asks of the tile lists beyond drawing: a soft surface depth, and each splat's own alpha·T.
+"""Contributions of single splats to a pixel: a soft surface depth, and the alpha·T of each splat in chosen pixels.
 
-Both walk the lists with a plain scan of static length, which forward and reverse mode differentiate as it stands;
-`tiles.blend` is faster and has a hand-written derivative, but gives only sums over splats.
+Both scan the lists with the static length of `scan_compositor`, which forward and reverse mode differentiate as it
+stands. `compositor` is faster and has a hand-written backward pass, but gives only sums over splats.
 """
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float, Int, Integer
 
 from pigjax.core.arrays import matmul
 from pigjax.core.camera import Camera
-from pigjax.splatting.binning import BlendConfig, blend_config, front_to_back
+from pigjax.splatting.alpha import Blend
+from pigjax.splatting.binning import BlendConfig, bin_splats, blend_config, into_tiles, rows_in_order, untile
 from pigjax.splatting.projection import project_splats
-from pigjax.splatting.scan_compositor import Chunks, all_chunks, walk
+from pigjax.splatting.scan_compositor import Chunks, all_chunks, scan_chunks
 from pigjax.splatting.types import RenderConfig, Splats
 
 _LEAST_PRESENCE = 1e-6  # below it a pixel has no surface; keeps its square within float32
@@ -30,25 +30,38 @@ def soft_surface_depth(
     tau_T: Float[Array, ""] | float,
     temperature: Float[Array, ""] | float,
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"], Int[Array, ""]]:
-    """Camera z [m] of the surface, how surely there is one (0 to 1), and the pairs dropped for want of capacity.
+    """Differentiable form of the surface depth (PIG, section 3.2).
 
     With c(T) = sigmoid((tau_T - T) / temperature), splat i has the share c(T after i) - c(T before i) of the surface:
     the probability that the transmittance crosses a threshold drawn around tau_T at that splat. The depth is the mean
-    under these shares. As the temperature falls to 0, depth and presence tend to the hard pick (PIG, section 3.2).
-    Differentiable in both modes with respect to every float argument.
+    under these shares. As the temperature falls to 0, depth and presence tend to the hard pick. Differentiable in
+    forward and reverse mode with respect to every float argument.
+
+    Args:
+        splats: the scene.
+        camera: a single camera.
+        config: the renderer's settings.
+        tau_T: transmittance at which the surface lies, in [0, 1].
+        temperature: width of the sigmoid, in units of transmittance, > 0.
+
+    Returns:
+        Camera z of the surface [m], 1 where there is none; the probability that there is one, 0 to 1; and the
+        splat/tile pairs dropped for want of capacity.
     """
-    chunks, blending, overflow = _chunks_seen(splats, camera, config)
+    chunks, blending, overflow = _chunks_of(splats, camera, config)
 
     def passed(transmittance):
         return jax.nn.sigmoid((tau_T - transmittance) / temperature)
 
-    def shares(chunk: Chunks, alpha, before, after):
+    def shares(chunk: Chunks, alpha, blend: Blend):
         # the splat that closes a pixel is not blended, yet it may be the surface
-        share = jnp.where(before > config.transmittance_min, passed(after) - passed(before), 0.0)
+        is_open = blend.before > config.transmittance_min
+        share = jnp.where(is_open, passed(blend.after) - passed(blend.before), 0.0)
         return jnp.stack([matmul(chunk.rows[:, _DEPTH], share), jnp.sum(share, 0)])
 
-    parts = walk(chunks, jnp.any(chunks.valid, 1), blending, shares)
-    depth, presence = _image(jax.ops.segment_sum(parts, chunks.tile, blending.tiles), blending)
+    parts = scan_chunks(chunks, jnp.any(chunks.valid, 1), blending, shares)
+    image = untile(jax.ops.segment_sum(parts, chunks.tile, blending.tiles), blending)
+    depth, presence = image[..., 0], image[..., 1]
     there = presence > _LEAST_PRESENCE
     depth = jnp.where(there, depth / jnp.where(there, presence, 1.0), 1.0)
     return depth, jnp.where(there, presence / (1 - passed(1.0)), 0.0), overflow
@@ -61,39 +74,38 @@ def credits_of_candidates(
     mask: Integer[Array, "h w"],
     candidates: Int[Array, "n j"],
 ) -> Float[Array, "n j"]:
-    """Sum of alpha·T of each splat over the pixels whose id is its candidate's; candidates of -1 get nothing.
+    """Sum of alpha·T of each splat over the pixels whose id is a candidate of the splat.
 
-    Only chunks up to a tile's last splat with candidates are blended, so few candidates cost little.
+    Chunks behind a tile's last splat with candidates are not blended, so few candidates cost little.
+
+    Args:
+        splats: the scene.
+        camera: a single camera.
+        config: the renderer's settings.
+        mask: id of each pixel.
+        candidates: ids of each splat; a candidate of -1 gets nothing.
     """
-    chunks, blending, _ = _chunks_seen(splats, camera, config)
+    chunks, blending, _ = _chunks_of(splats, camera, config)
     asked = (candidates[chunks.splat] >= 0) & chunks.valid[..., None]
     index = jnp.arange(chunks.tile.shape[0])
     last_asked = jax.ops.segment_max(jnp.where(jnp.any(asked, (1, 2)), index, -1), chunks.tile, blending.tiles)
-    padding = [(0, -size % blending.tile) for size in mask.shape]
-    tiled = jnp.pad(mask, padding, constant_values=-1).astype(jnp.int32)
-    tiled = tiled.reshape(-1, blending.tile, blending.columns, blending.tile).transpose(0, 2, 1, 3)
-    ids = tiled.reshape(blending.tiles, -1)
+    ids = into_tiles(mask.astype(jnp.int32), -1, blending)
 
-    def credit(chunk: Chunks, alpha, before, after):
-        weight = jnp.where(after > config.transmittance_min, alpha * before, 0.0)
+    def credit(chunk: Chunks, alpha, blend: Blend):
         match = candidates[chunk.splat][:, :, None] == ids[chunk.tile]
-        return jnp.sum(jnp.where(match, weight[:, None], 0.0), 2)
+        return jnp.sum(jnp.where(match, blend.weight[:, None], 0.0), 2)
 
-    parts = walk(chunks, index <= last_asked[chunks.tile], blending, credit)
+    parts = scan_chunks(chunks, index <= last_asked[chunks.tile], blending, credit)
     credits = jnp.zeros(candidates.shape, parts.dtype)
     return credits.at[chunks.splat].add(jnp.where(asked, parts, 0.0))
 
 
-def _chunks_seen(splats: Splats, camera: Camera, config: RenderConfig) -> tuple[Chunks, BlendConfig, Int[Array, ""]]:
-    projected = project_splats(splats, camera, config)
+def _chunks_of(splats: Splats, camera: Camera, config: RenderConfig) -> tuple[Chunks, BlendConfig, Int[Array, ""]]:
+    """Chunks of a view whose only feature is the depth, its static settings, and the pairs dropped."""
+    with jax.named_scope("project"):
+        projected = project_splats(splats, camera, config)
     blending = blend_config(camera, config, len(splats), surface=True)
-    boxes = front_to_back(lax.stop_gradient(projected), blending)
-    table = jnp.concatenate([projected.shapes, projected.depths[:, None]], 1)[boxes.order]
-    chunks, overflow = all_chunks(table, boxes, blending)
+    with jax.named_scope("bin"):
+        boxes = bin_splats(projected, blending)
+    chunks, overflow = all_chunks(rows_in_order(projected, projected.depths[:, None], boxes), boxes, blending)
     return chunks, blending, overflow
-
-
-def _image(planes: Float[Array, "tiles c pixels"], config: BlendConfig) -> Float[Array, "c h w"]:
-    rows = config.tiles // config.columns
-    image = planes.reshape(rows, config.columns, -1, config.tile, config.tile).transpose(2, 0, 3, 1, 4)
-    return image.reshape(-1, rows * config.tile, config.columns * config.tile)[:, : config.height, : config.width]

@@ -1,4 +1,4 @@
-"""EWA projection of splats onto the image plane (Zwicker et al. 2001)."""
+"""Projection: splats onto the image plane by EWA splatting (Zwicker et al. 2001)."""
 
 from __future__ import annotations
 
@@ -10,15 +10,24 @@ from pigjax.core.arrays import einsum, in_precision
 from pigjax.core.camera import Camera, to_camera
 from pigjax.core.extent import typical_distance
 from pigjax.core.linalg import svd
-from pigjax.splatting.binning import Projected
-from pigjax.splatting.types import RenderConfig, Splats
+from pigjax.splatting.types import Projected, RenderConfig, Splats
 
 _NEAR = 0.01  # of the splats' typical distance from the camera: 1 cm at 1 m
-_FOV_MARGIN = 0.3  # the projection's linearisation is held at this share of half the image beyond its edge
+_FOV_MARGIN = 0.3  # of half the image, beyond its edge: the projection is linearised no further aside
 
 
 def project_splats(splats: Splats, camera: Camera, config: RenderConfig) -> Projected:
-    """EWA projection from the factor: 2D covariance = (J W M)(J W M)ᵀ + dilation (Zwicker et al. 2001)."""
+    """Splats on the image plane (EWA splatting, Zwicker et al. 2001; Kerbl et al. 2023, eq. 5).
+
+    From the factor M of the covariance, the 2D covariance is (J W M)(J W M)ᵀ + dilation, where W is the rotation to the
+    camera and J the linearised projection. The direction at which J is taken is clamped a little beyond the image, as
+    in 3DGS, since far aside the linearisation makes splats cover everything.
+
+    Args:
+        splats: the scene, in the world.
+        camera: a single camera; taken in the precision of the splats.
+        config: dilation, antialiasing, near plane and alpha_min.
+    """
     camera = in_precision(camera, splats.means.dtype)
     fx, fy = camera.focal
     cx, cy = camera.centre
@@ -27,11 +36,11 @@ def project_splats(splats: Splats, camera: Camera, config: RenderConfig) -> Proj
     z = jnp.where(ahead, depth, 1.0)
     u, v = x / z, y / z
     margin_x, margin_y = _FOV_MARGIN * camera.width / (2 * fx), _FOV_MARGIN * camera.height / (2 * fy)
-    held_u = jnp.clip(u, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
-    held_v = jnp.clip(v, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
+    clamped_u = jnp.clip(u, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
+    clamped_v = jnp.clip(v, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
     rotated = einsum("ij,njk->ink", camera.world_to_cam[:3, :3], splats.factors)
-    row_x = (rotated[0] - held_u[:, None] * rotated[2]) * (fx / z)[:, None]
-    row_y = (rotated[1] - held_v[:, None] * rotated[2]) * (fy / z)[:, None]
+    row_x = (rotated[0] - clamped_u[:, None] * rotated[2]) * (fx / z)[:, None]
+    row_y = (rotated[1] - clamped_v[:, None] * rotated[2]) * (fy / z)[:, None]
     a, b, c = (jnp.sum(p * q, 1) for p, q in ((row_x, row_x), (row_x, row_y), (row_y, row_y)))
     opacities = splats.opacities
     if config.antialias:
@@ -59,14 +68,14 @@ def project_splats(splats: Splats, camera: Camera, config: RenderConfig) -> Proj
 
 
 def near_plane(splats: Splats, camera: Camera, config: RenderConfig) -> Float[Array, ""] | float:
-    """Camera z [m] up to which nothing is drawn and nothing votes; it scales with the scene unless set."""
+    """Camera z up to which nothing is drawn and nothing votes [m]: `config.near`, else a share of typical distance."""
     if config.near is not None:
         return config.near
     return _NEAR * typical_distance(splats.means, lax.stop_gradient(camera.position))
 
 
 def normals(splats: Splats, camera: Camera) -> Float[Array, "n 3"]:
-    """Shortest axis of each splat, in the world, on the side of the camera."""
+    """Normal of each splat, in the world, towards the camera: its shortest axis."""
     axis = svd(splats.factors)[0][..., 2]
     away = jnp.sum(axis * (splats.means - camera.position), 1, keepdims=True) > 0
     return jnp.where(away, -axis, axis)

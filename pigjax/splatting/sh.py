@@ -1,4 +1,4 @@
-"""View-dependent colour: real spherical harmonics in the order and signs of 3DGS (Kerbl et al. 2023)."""
+"""Shading: view-dependent colour by real spherical harmonics, in the order and signs of 3DGS (Kerbl et al. 2023)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,16 @@ from pigjax.splatting.types import Gaussians, Splats
 
 
 def colours(splats: Splats, camera: Camera, sh_degree: int | None = None) -> Float[Array, "n 3"]:
-    """Colour of each splat as the camera sees it, at least 0; colour turns with the splat's `sh_rotations`."""
+    """Colour of each splat in the direction from the camera, at least 0.
+
+    Args:
+        splats: the scene; the direction is turned into the splat's rest frame by `sh_rotations`.
+        camera: a single camera.
+        sh_degree: highest degree used; None: all that the splats have.
+
+    Raises:
+        InputError: the number of coefficients is not 1, 4, 9 or 16.
+    """
     degree = sh_degree_of(splats) if sh_degree is None else min(sh_degree, sh_degree_of(splats))
     if degree == 0:
         return jnp.maximum(SH_CONSTANT * splats.sh[:, 0] + 0.5, 0.0)
@@ -26,20 +35,20 @@ def colours(splats: Splats, camera: Camera, sh_degree: int | None = None) -> Flo
 
 
 def sh_degree_of(gaussians: Gaussians | Splats) -> int:
-    """Highest band of spherical harmonics that is stored.
+    """Degree of the spherical harmonics, 0 to 3, from the number of coefficients (degree + 1)².
 
     Raises:
         InputError: the number of coefficients is not 1, 4, 9 or 16.
     """
-    bands = {1: 0, 4: 1, 9: 2, 16: 3}
+    degrees = {1: 0, 4: 1, 9: 2, 16: 3}
     count = gaussians.sh.shape[1]
-    if count not in bands:
+    if count not in degrees:
         raise InputError(f"sh has {count} coefficients per channel: 1, 4, 9 or 16 are needed (degree 0 to 3).")
-    return bands[count]
+    return degrees[count]
 
 
 def sh_basis(directions: Float[Array, "n 3"], degree: int) -> Float[Array, "n k"]:
-    """Real spherical harmonics up to a degree at unit directions, in the order and signs of 3DGS."""
+    """Real spherical harmonics up to a degree at unit directions, in the order and signs of 3DGS; k = (degree + 1)²."""
     x, y, z = directions.T
     basis = [jnp.full_like(x, SH_CONSTANT)]
     if degree > 0:

@@ -1,4 +1,4 @@
-"""What the rasterizer takes and gives: posed splats, frames, and its settings."""
+"""Inputs and outputs of the rasterizer: posed splats, projected splats, frames, and the settings."""
 
 from __future__ import annotations
 
@@ -6,77 +6,116 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from pigjax.core.arrays import array_field, static_field
-from pigjax.core.checks import LARGEST_WHOLE, Limits, check_fields
+from pigjax.core.arrays import real_field, static_field
+from pigjax.core.checks import LARGEST_WHOLE, Limits, check_axes, check_fields
 from pigjax.core.errors import InputError
 from pigjax.core.extent import Extent, scene_extent
 from pigjax.core.gaussians import Gaussians
 from pigjax.core.linalg import quat_to_matrix
 
-__all__ = ["OUTPUTS", "Frame", "Gaussians", "RenderConfig", "Splats", "as_splats", "extent_of", "gaussian_factors"]
+__all__ = [
+    "OUTPUTS",
+    "Frame",
+    "Gaussians",
+    "Projected",
+    "RenderConfig",
+    "Splats",
+    "as_splats",
+    "extent_of",
+    "gaussian_factors",
+]
 OUTPUTS = ("rgb", "alpha", "depth", "surface_depth", "object_weights", "normals", "features")
 
 
 class Splats(eqx.Module):
-    """Posed Gaussians, ready to draw: covariance = factors @ factorsᵀ."""
+    """Posed Gaussians, ready to draw. The covariance of each is factors @ factorsᵀ.
 
-    means: Float[Array, "n 3"] = array_field()  # [m]
-    factors: Float[Array, "n 3 3"] = array_field()  # [m]
-    opacities: Float[Array, "n"] = array_field()  # in [0, 1]
-    sh: Float[Array, "n k 3"] = array_field()
-    sh_rotations: Float[Array, "n 3 3"] | None = array_field(
-        default=None
-    )  # turns view-dependent colour with the matter
+    Raises:
+        InputError: an array has not its axes, or is not as long as the others.
+    """
+
+    means: Float[Array, "n 3"] = real_field()  # [m]
+    factors: Float[Array, "n 3 3"] = real_field()  # [m]
+    opacities: Float[Array, "n"] = real_field()  # in [0, 1]
+    sh: Float[Array, "n k 3"] = real_field()  # spherical harmonics, k = (degree + 1)²
+    # rotation of the matter since rest; view-dependent colour turns with it
+    sh_rotations: Float[Array, "n 3 3"] | None = real_field(default=None)
+
+    def __check_init__(self):
+        check_axes(self)
 
     def __len__(self) -> int:
         return self.means.shape[0]
 
 
-class Frame(eqx.Module):
-    """One drawn image; outputs that were not asked for are None."""
+class Projected(eqx.Module):
+    """Splats on the image plane (`projection.project_splats`)."""
 
-    rgb: Float[Array, "*b h w 3"] | None = None
-    alpha: Float[Array, "*b h w"] | None = None
-    depth: Float[Array, "*b h w"] | None = None  # mean camera z of what is seen [m], 0 where nothing is
-    surface_depth: Float[Array, "*b h w"] | None = None  # camera z [m], NaN where transmittance stays above tau_T
+    centres: Float[Array, "n 2"]  # [px]
+    conics: Float[Array, "n 3"]  # inverse 2D covariance, entries xx, xy, yy [1/px²]
+    opacities: Float[Array, "n"]  # in [0, 1]
+    depths: Float[Array, "n"]  # camera z [m]
+    radii: Float[Array, "n 2"]  # half extents of the box outside which alpha < alpha_min [px]
+    visible: Bool[Array, "n"]  # beyond the near plane, on the image, and not too faint
+
+    @property
+    def shapes(self) -> Float[Array, "n 6"]:
+        """Columns from which a tile computes alpha: x, y, conic xx, xy, yy, log opacity."""
+        there = self.opacities > 0
+        peaks = jnp.where(there, jnp.log(jnp.where(there, self.opacities, 1.0)), -jnp.inf)
+        return jnp.concatenate([self.centres, self.conics, peaks[:, None]], 1)
+
+
+class Frame(eqx.Module):
+    """One image; outputs that were not asked for are None."""
+
+    rgb: Float[Array, "*b h w 3"] | None = None  # linear in the splats' colours, not clipped
+    alpha: Float[Array, "*b h w"] | None = None  # sum of alpha·T, in [0, 1]
+    depth: Float[Array, "*b h w"] | None = None  # mean of camera z weighted by alpha·T [m], 0 where alpha is 0
+    surface_depth: Float[Array, "*b h w"] | None = None  # camera z [m], NaN where the transmittance stays above tau_T
     object_weights: Float[Array, "*b h w m"] | None = None  # share of each object in the pixel
-    normals: Float[Array, "*b h w 3"] | None = None  # unit, in the world, towards the camera; 0 where nothing is
+    normals: Float[Array, "*b h w 3"] | None = None  # unit, in the world, towards the camera; 0 on empty pixels
     features: Float[Array, "*b h w f"] | None = None  # sums of each splat's features weighted by alpha·T
-    overflow: Int[Array, "*b"] | None = None  # box/tile pairs dropped for want of capacity
+    overflow: Int[Array, "*b"] | None = None  # splat/tile pairs dropped for want of capacity
 
 
 class RenderConfig(eqx.Module):
-    """Every approximation of the renderer, static.
+    """Thresholds, capacities and devices of the renderer; all static, so a new value recompiles.
+
+    `alpha_min`, `alpha_max`, `transmittance_min` and `dilation` are those of 3DGS (Kerbl et al. 2023).
 
     Raises:
-        InputError: a number is not finite or out of range, or a choice does not exist.
+        InputError: a number is not finite or out of range, a choice does not exist, or alpha_min >= alpha_max.
     """
 
     tile_size: int = static_field(default=16, limits=Limits(1, 1024, unit="px"))
-    # box/tile pairs listed per image; None: all, or see below
+    # splat/tile pairs per image, far splats dropped first; None: unlimited ("forward": 16 per splat)
     capacity: int | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
-    # of them sorted at once; None: 2¹⁷ on a CPU, 2²¹ elsewhere, / bands
+    # splat/tile pairs binned in one pass; None: 2¹⁷ on a CPU, 2²¹ elsewhere, divided by `bands`
     slots: int | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
-    sh_degree: int | None = static_field(default=None, limits=Limits(0, 3))  # None: all bands that the splats have
+    sh_degree: int | None = static_field(default=None, limits=Limits(0, 3))  # None: the degree that the splats have
     # fainter contributions are skipped
     alpha_min: float = static_field(default=1 / 255, limits=Limits(0, 1, below=True))
+    # a splat never hides more than this
     alpha_max: float = static_field(default=0.99, limits=Limits(0, 1, above=True))
-    # a pixel is closed before it falls below
+    # a splat that would take the transmittance of a pixel to this or below closes the pixel and is not blended
     transmittance_min: float = static_field(default=1e-4, limits=Limits(0, 1, below=True))
     dilation: float = static_field(default=0.3, limits=Limits(0, 1e6, unit="px²"))  # added to the 2D covariance
-    antialias: bool = static_field(default=False)  # lower the opacity by what the dilation added
-    # None: a hundredth of the splats' typical distance
+    # scale the opacity so that the dilation keeps the splat's integral (Yu et al. 2024, Mip-Splatting)
+    antialias: bool = static_field(default=False)
+    # nearer splats are not drawn; None: a hundredth of the splats' typical distance
     near: float | None = static_field(default=None, limits=Limits(0.0, 1e9, unit="m"))
-    # splats blended between two looks at a tile; None: 64, or 16 if few
+    # splats blended before a tile is tested for being opaque; None: 64, or 16 where a tile has few splats
     chunk: int | None = static_field(default=None, limits=Limits(1, 1_000_000))
-    # walked together; None: 1 on a CPU, 2048 elsewhere
+    # tiles composited in one vectorised loop; None: 1 on a CPU, 2048 elsewhere
     tiles_at_once: int | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
-    # local devices that share the image, each a band of rows
+    # local devices that share the image (`splatting.sharding`), each with some rows of tiles
     bands: int = static_field(default=1, limits=Limits(1, 4096))
-    # "forward" goes through any mode and order (jvp, hessian), but is slower, and its lists have a static capacity: 16
-    # pairs per splat unless given (`required_capacity` finds it); what does not fit is counted in Frame.overflow
+    # "reverse": the fast compositor with its hand-written backward pass. "forward": a scan that every mode and order
+    # of differentiation (jvp, hessian) goes through; it is slower, and its lists have a static capacity: 16 pairs per
+    # splat unless given (`required_capacity` finds it). What does not fit is counted in Frame.overflow
     differentiation: str = static_field(default="reverse", choices=("reverse", "forward"))
 
     def __check_init__(self):
@@ -88,12 +127,12 @@ class RenderConfig(eqx.Module):
 
 
 def gaussian_factors(gaussians: Gaussians) -> Float[Array, "n 3 3"]:
-    """Factors M = R S of the covariances M Mᵀ [m]."""
+    """Factors M = R S of the covariances M Mᵀ [m] (Kerbl et al. 2023, equation 6)."""
     return quat_to_matrix(gaussians.quats) * jnp.exp(gaussians.log_scales)[:, None, :]
 
 
 def as_splats(gaussians: Gaussians | Splats) -> Splats:
-    """Gaussians as they stand, undeformed."""
+    """Gaussians in their rest pose as splats; splats as they are."""
     if isinstance(gaussians, Splats):
         return gaussians
     opacities = jax.nn.sigmoid(gaussians.logit_opacities)
@@ -101,10 +140,10 @@ def as_splats(gaussians: Gaussians | Splats) -> Splats:
 
 
 def extent_of(gaussians: Gaussians) -> Extent:
-    """Middle and size of the dense core of Gaussians, host; see `scene_extent`.
+    """Centre and size of the dense core of Gaussians [m]; see `scene_extent`. Host.
 
     Raises:
-        InputError: there is no Gaussian with a finite centre.
+        InputError: no Gaussian has a finite centre.
     """
     opacities = np.asarray(jax.nn.sigmoid(gaussians.logit_opacities))
     return scene_extent(np.asarray(gaussians.means), opacities, np.exp(np.asarray(gaussians.log_scales).max(1)))

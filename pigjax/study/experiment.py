@@ -1,4 +1,4 @@
-"""A scene as a pure function of named parameters: what studies vary, simulate, draw and score.
+"""A scene as a pure function of named parameters: varied, simulated, drawn and scored by studies.
 
 Parameters have the names of the scene file's fields: "objects.duck.young", "objects.duck.velocity", "clamp.lambda_R",
 "simulation.gravity", "planes.ground.friction". A scene file is read once; from there all is arrays, so that an
@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from scipy.cluster.vq import kmeans2
 
 from pigjax.clamp import ClampParams
@@ -33,9 +33,10 @@ from pigjax.mpm.active_grid import box_for
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.materials import Material, MaterialTable, Parameters
-from pigjax.mpm.timestep import first_substeps, stable_dt
+from pigjax.mpm.timestep import stable_dt, substep_rule
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, render_config, segment
 from pigjax.scene.schema import Scene
+from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, RenderConfig, Splats, render
 
 _NUMBERS = tuple(field.name for field in fields(Parameters))
@@ -43,7 +44,7 @@ _CLAMP = ("tau_min", "tau_max", "lambda_R", "lambda_S")
 
 
 class Outcome(NamedTuple):
-    """An experiment and how its simulation went."""
+    """An experiment and the result of its simulation."""
 
     experiment: Experiment
     particles: Particles  # at the end
@@ -52,34 +53,34 @@ class Outcome(NamedTuple):
 
 
 class Experiment(eqx.Module):
-    """All that a scene needs to be simulated and drawn, on one grid that holds the whole motion."""
+    """A scene as a pytree of arrays: simulated and drawn on one grid that holds the whole motion."""
 
-    gaussians: Gaussians
+    gaussians: Gaussians  # of the whole scene, at rest
     particles: Particles  # at rest
-    table: MaterialTable
-    binding: Binding | None
-    grid: Grid
-    colliders: tuple[Collider, ...]
-    contact: BodyContact | None
+    table: MaterialTable  # a row for each material or region
+    binding: Binding | None  # of Gaussians without a particle; None: there are none
+    grid: Grid  # holds the motion of all `extremes`
+    colliders: tuple[Collider, ...]  # in the order of `solids`
+    contact: BodyContact | None  # between objects; None: one velocity field
     gravity: Float[Array, "3"]  # [m/s²]
     frame_dt: Float[Array, ""]  # [s]
-    clamp: ClampParams
+    clamp: ClampParams  # of the posing
     cameras: Camera  # one for each frame of the video, the first at rest
-    background: Float[Array, "*3"]
-    config: SimConfig = eqx.field(static=True)
-    render: RenderConfig = eqx.field(static=True)
+    background: Float[Array, "*3"]  # colour in [0, 1]
+    config: SimConfig = eqx.field(static=True)  # with the substeps that all `extremes` need
+    render: RenderConfig = eqx.field(static=True)  # of the video
     mode: str = eqx.field(static=True)  # of the clamp
-    frames: int = eqx.field(static=True)
+    frames: int = eqx.field(static=True)  # of the simulation; the video has one more
     rows: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)  # of the table, by moving object
     solids: tuple[str, ...] = eqx.field(static=True)  # names of the colliders: "objects.table", "planes.ground"
 
     def with_parameters(self, values: Mapping[str, Any]) -> Experiment:
-        """The same experiment with other numbers.
+        """The same experiment with other numbers, by the names of the scene file.
 
         A number of an object that was split into regions may be one for all of it or one for each.
 
         Raises:
-            SceneError: a name that the scene has not, with the nearest right one.
+            SceneError: the scene has no such name; the message tells the nearest right one.
         """
         changed = self
         for name, value in values.items():
@@ -90,7 +91,7 @@ class Experiment(eqx.Module):
         """Present value of a parameter.
 
         Raises:
-            SceneError: a name that the scene has not, or one without a value.
+            SceneError: the scene has no such name, or gives it no value.
         """
         kind, middle, field = self._split(name)
         if kind == "clamp":
@@ -280,11 +281,11 @@ def experiment(
 
 
 def _only_named(inputs: Inputs, plan: Plan) -> tuple[Inputs, Plan]:
-    """Without the Gaussians of other objects; what is left is counted anew."""
+    """Without the Gaussians of other objects; the rest is renumbered."""
     object_id = np.asarray(plan.labels.object_id)
     kept = np.isin(object_id, [0, *inputs.ids.values()])
     row = jnp.asarray(np.cumsum(kept) - 1)
-    labels = jax.tree.map(lambda column: column[kept] if column.ndim else column, plan.labels)
+    labels = _of_some(plan.labels, kept)
     carried = plan.particles.gaussian
     particles = replace(plan.particles, gaussian=jnp.where(carried >= 0, row[carried], -1).astype(carried.dtype))
     binding = plan.binding
@@ -292,6 +293,12 @@ def _only_named(inputs: Inputs, plan: Plan) -> tuple[Inputs, Plan]:
         binding = replace(binding, gaussian=row[binding.gaussian])
     gaussians = jax.tree.map(lambda column: column[kept], inputs.gaussians)
     return replace(inputs, gaussians=gaussians), replace(plan, particles=particles, binding=binding, labels=labels)
+
+
+def _of_some(labels: Labels, kept: Bool[np.ndarray, "n"]) -> Labels:
+    """Labels of some of the Gaussians; the columns of the votes stay."""
+    own = {name: getattr(labels, name)[kept] for name in ("object_id", "votes", "confidence")}
+    return replace(labels, **own)
 
 
 def _assemble(scene: Scene, inputs: Inputs, plan: Plan) -> Experiment:
@@ -351,15 +358,16 @@ def _fitted(made: Experiment, dx: float, extremes: list[Mapping[str, Any]], marg
     """With substeps and a grid that serve all extremes."""
     cases = [case for values in extremes if (case := made.with_parameters(values))._is_possible()]
 
-    def steps(case: Experiment) -> dict[str, Any]:
-        return {
-            "frames": case.frames,
-            "frame_dt": float(case.frame_dt),
-            "gravity": np.asarray(case.gravity),
-            "colliders": case.colliders,
-        }
-
-    config, _ = first_substeps(made.particles, made.grid, made.table, made.config, **steps(made))
+    config = substep_rule(
+        made.particles,
+        made.grid,
+        made.table,
+        made.config,
+        frames=made.frames,
+        frame_dt=float(made.frame_dt),
+        gravity=np.asarray(made.gravity),
+        colliders=made.colliders,
+    ).config
     reached, runs, substeps = [np.asarray(made.particles.x)], [], 1
     for case in cases:
         _, _, trajectory, health = replace(case, config=config).simulate()

@@ -1,12 +1,13 @@
-"""What a study may score: pure functions of an `Outcome`, each a dictionary of scalars.
+"""Objectives of studies: pure functions of an `Outcome`, each a dictionary of scalars.
 
-One of them named "loss" is what tuning makes small. Where the simulation broke down or left its grid, all are NaN.
+Tuning minimises the scalar named "loss". Where the simulation broke down or left its grid, all are NaN.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import inspect
+import os
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -33,7 +34,7 @@ Objective = Callable[[Outcome], Scores]
 
 
 def motion(outcome: Outcome) -> Scores:
-    """Where each object is at the end [m], how fast [m/s], and the health of the simulation."""
+    """Place [m] and speed [m/s] of each object at the end, and the health of the simulation."""
     scores: Scores = {}
     particles, health = outcome.particles, outcome.health
     for name, rows in outcome.experiment.rows:
@@ -125,7 +126,7 @@ def video(outcome: Outcome, *, target: Float[Array, "t h w 3"], levels: int = 1)
 def pyramid_error(seen: Float[Array, "t h w 3"], target: Float[Array, "t h w 3"], levels: int) -> Float[Array, ""]:
     """Sum of the mean squared differences of two videos at full size, half of it, and so on, `levels` sizes in all.
 
-    What is drawn beside where it should be, without touching it, has a slope in the small pictures only.
+    An object drawn beside its true place, without touching it, has a slope in the small pictures only.
     """
     difference, total = seen - target, jnp.zeros((), seen.dtype)
     for _ in range(levels):
@@ -169,7 +170,7 @@ def _healthy(objective: Objective, outcome: Outcome) -> Scores:
 
 
 def _scores(objective: Objective, outcome: Outcome) -> Scores:
-    """Scores of an objective; what its own code raises is told with file and line."""
+    """Scores of an objective; exceptions of its own code are reported with file and line."""
     function = objective.func if isinstance(objective, partial) else objective
     file = getattr(getattr(function, "__code__", None), "co_filename", "")
     if function in OBJECTIVES.values():
@@ -192,7 +193,7 @@ def _share(outcome: Outcome, rows: tuple[int, ...]) -> Float[Array, "p"]:
 
 
 def _from_file(path: Path, name: str) -> Callable[..., Scores]:
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise MissingFileError(f"{path}: file of objective.function does not exist; check the path.")
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if spec is None or spec.loader is None:
@@ -209,7 +210,7 @@ def _from_file(path: Path, name: str) -> Callable[..., Scores]:
 
 @contextmanager
 def _running(path: Path) -> Iterator[None]:
-    """Turn what the code of a study raises into one sentence with its file and line.
+    """Turn exceptions of a study's code into one sentence with its file and line.
 
     Raises:
         InputError: the block raised any exception but an InputError.
@@ -219,7 +220,8 @@ def _running(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except SyntaxError as error:
-        raise InputError(f"{error.filename or path}, line {error.lineno}: {error.msg}; mend the objective.") from error
+        where = f"{error.filename or path}" + (f", line {error.lineno}" if error.lineno else "")
+        raise InputError(f"{where}: {error.msg}; mend the objective.") from error
     except (Exception, SystemExit) as error:
         frames = traceback.extract_tb(error.__traceback__)
         line = next((frame.lineno for frame in reversed(frames) if Path(frame.filename) == path), None)
@@ -250,12 +252,12 @@ def _check_options(found: Callable[..., Scores], options: dict[str, Any], functi
 def _read_target(folder: Path, target: str) -> Float[Array, "t h w 3"]:
     """Frames of a folder of pictures, of a video, or of an `.npy` file."""
     path = folder / target
-    if path.is_dir():
+    if os.path.isdir(path):
         pictures = [io.read_image(picture) for picture in sorted(path.glob("*.png"))]
         if len({picture.shape for picture in pictures}) != 1:
             raise InputError(f"{path}: objective.options.target needs .png frames, all of one size.")
         return jnp.asarray(np.stack(pictures))
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise MissingFileError(f"{path}: objective.options.target does not exist; check the path.")
     if path.suffix != ".npy":
         return jnp.asarray(io.read_video(path))

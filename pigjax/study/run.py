@@ -24,7 +24,7 @@ from pigjax.study.schema import MOST_ROWS, Study, Value
 from pigjax.study.voting import Voting, voting
 
 Row = Mapping[str, Any]
-_FILES = ("gaussians", "names", "masks")  # of a scene; its photos and cameras enter by what is computed from them
+_FILES = ("gaussians", "names", "masks")  # of a scene; its photos and cameras enter by the results computed from them
 _SOFT_VOTES = 0.002  # temperature of a tuned vote that states none: a wider one tells no small tau_d from a larger
 
 
@@ -39,17 +39,17 @@ def sweep_study(
     """Score every set of parameters of a study. Host.
 
     Into `out_dir` go `table.csv`, `table.npz`, `sweep.png` (a curve of one parameter, a heat map of two), `best.json`
-    and `best.toml`, the scene with the best values. What is finished is kept, so that a killed sweep goes on. Where
+    and `best.toml`, the scene with the best values. Finished rows are kept, so that a killed sweep resumes. Where
     all parameters are of the clamp, one simulation serves all.
 
     Args:
         study: as `load_study` gives it.
         out_dir: folder for the results, made if it is missing.
-        progress: told rows done and rows to do.
+        progress: called with rows done and rows to do.
         overwrite: replace rows that were made from something else, instead of refusing them.
 
     Raises:
-        StaleError: `out_dir` holds rows of another study, scene, objective or other files; it names what changed.
+        StaleError: `out_dir` holds rows of another study, scene, objective or other files; it names the changes.
         InputError: a file is missing, a parameter or an objective is unknown, or nothing could be scored.
     """
     out = io.output_folder(
@@ -71,8 +71,9 @@ def sweep_study(
     if jax.process_index() == 0:
         table.save(out / "table.csv")
         table.save(out / "table.npz")
+        best = table.best(study.sweep.of, mode=study.sweep.best)  # tells why, where no row is good
         _draw(study, table, out / "sweep.png")
-        _leave_best(study, table.best(study.sweep.of, mode=study.sweep.best), out)
+        _leave_best(study, best, out)
     return table
 
 
@@ -87,16 +88,16 @@ def tune_study(
     """Find the parameters of least loss. Host.
 
     Into `out_dir` go `history.npz`, `history.png`, `best.json` and `best.toml`, the scene with the best values. A
-    killed search goes on from its checkpoint.
+    killed search resumes from its checkpoint.
 
     Args:
         study: as `load_study` gives it.
         out_dir: folder for the results, made if it is missing.
-        progress: told steps done, steps to do, and the loss in words.
+        progress: called with steps done, steps to do, and the loss in words.
         overwrite: start over where the checkpoint belongs to something else, instead of refusing it.
 
     Raises:
-        StaleError: `out_dir` holds the search of another study, scene, objective or other files; it names what changed.
+        StaleError: `out_dir` holds the search of another study, scene, objective or other files; it names the changes.
         InputError: a file is missing, a parameter or an objective is unknown, a start lies out of bounds.
         SimulationError: nothing that was tried could be simulated.
     """
@@ -156,7 +157,7 @@ def _parts(study: Study, unused: str) -> dict[str, Any]:
 
 
 def _trial(study: Study, rows: Sequence[Row], *, soft: bool) -> tuple[Callable[..., Scores], tuple[Any, ...]]:
-    """Scores of parameters as a pure function of them and of what all share."""
+    """Scores of parameters as a pure function of them and of the shared inputs."""
     scene = study.to_scene()
     of_votes = [name.startswith("segmentation.") for name in study.parameters]
     if all(of_votes):

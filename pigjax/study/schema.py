@@ -1,4 +1,4 @@
-"""The study file: which parameters of which scene vary, what is scored, and how the best are sought."""
+"""The study file: the scene, its varying parameters, the objective, and the search."""
 
 from __future__ import annotations
 
@@ -70,10 +70,10 @@ class ParameterSpec(Section, frozen=True):
 
 
 class SweepSpec(Section, frozen=True):
-    """How the parameters' values are joined, and what of the results is shown."""
+    """Combination of the parameters' values, and the result that is shown."""
 
     join: Literal["grid", "rows"] = "grid"  # all combinations, or the k-th value of each together
-    batch: Annotated[int, Limits(1, MOST_ROWS)] | None = None  # rows at once; None: what memory holds
+    batch: Annotated[int, Limits(1, MOST_ROWS)] | None = None  # rows at once; None: as many as memory holds
     best: Literal["min", "max"] = "min"
     of: str = "loss"  # the result that is judged and drawn
 
@@ -101,6 +101,10 @@ class AimOptions(Section, frozen=True):
     # where its middle is to be; axes that are NaN do not count
     target: Annotated[tuple[float, float, float], Limits(-1e9, 1e9, unit="m", nan=True)]
     frame: Annotated[int, Limits(-100_000, 99_999)] = -1  # after which it is looked at, from 0; -1: the last
+
+    def rules(self) -> Iterable[tuple[str, bool, str]]:
+        """Some axis counts."""
+        yield "target", not np.isnan(self.target).all(), "give a number for one axis or more, or nothing is aimed at"
 
 
 class ShapeOptions(Section, frozen=True):
@@ -133,13 +137,13 @@ OPTIONS: dict[str, type[Section]] = {
 
 
 class ObjectiveSpec(Section, frozen=True):
-    """What is scored: one of `study.OBJECTIVES`, or `file.py:function` beside the study file."""
+    """The objective: one of `study.OBJECTIVES`, or `file.py:function` beside the study file."""
 
     function: str
     options: dict[str, Any] = field(default_factory=dict)
 
     def check(self) -> None:
-        """Whether there is such an objective, and what it is told is right as far as it is known. Host.
+        """Whether there is such an objective, and its options are right as far as they are known. Host.
 
         Raises:
             SceneError: there is no such objective, or an option is unknown, is missing, or has a wrong value.
@@ -168,14 +172,16 @@ class Study(Section, frozen=True):
     regions: dict[str, Annotated[int, Limits(1, 10_000)]] = field(default_factory=dict)
     sweep: SweepSpec = SweepSpec()
     tune: TuneSpec = TuneSpec()
-    folder: str = "."  # set by `load_study`; what relative paths start from
+    folder: str = "."  # set by `load_study`; the base of relative paths
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """Something varies."""
         yield "parameters", bool(self.parameters), "a study varies one or more"
+        twice = self.only is not None and len(set(self.only)) < len(self.only)
+        yield "only", not twice, "an object is named twice; name each once"
 
     def to_scene(self) -> Scene:
-        """The scene with what is different in this study.
+        """The scene with the changes of this study.
 
         Raises:
             MissingFileError: there is no such scene file.
@@ -187,7 +193,7 @@ class Study(Section, frozen=True):
     def scene_values(self, parameters: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         """Contents of a scene file in another folder, with these parameters.
 
-        Left out is what a scene file has no place for: numbers of an object's parts, the time between frames.
+        Left out are values without a place in a scene file: numbers of an object's parts, the time between frames.
         """
         values = self._values()
         for name, value in parameters.items():
@@ -227,10 +233,14 @@ def _put(values: dict[str, Any], name: str, value: Any) -> None:
 
 @checked
 def load_study(path: str | Path, *, method: str | None = None) -> Study:
-    """Read and check a study file; `method`, if given, is that of `tune`. Host.
+    """Read and check a study file. Host.
 
     A study whose objective is a function of a Python file runs that file: where it lies outside the working folder, a
     warning says so.
+
+    Args:
+        path: the file (.toml).
+        method: "adam" or "cma", instead of the file's `tune.method`.
 
     Raises:
         MissingFileError: there is no such file.
@@ -248,8 +258,8 @@ def load_study(path: str | Path, *, method: str | None = None) -> Study:
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error.__cause__
     if study.objective.is_code():
-        code = (path.parent / study.objective.function.rpartition(":")[0]).resolve()
-        if not code.is_relative_to(Path.cwd()):
+        code = path.parent / study.objective.function.rpartition(":")[0]
+        if os.path.isfile(code) and not (code := code.resolve()).is_relative_to(Path.cwd()):
             warnings.warn(
                 f"{path}: objective.function runs the Python code of {code}, outside the working folder; go on only if"
                 " you trust it.",

@@ -59,7 +59,7 @@ class Voting(eqx.Module):
         """Loss and agreement of the objects with the held-out masks.
 
         A Gaussian belongs to each object by its share of the votes, or of one where it has less (all to the winner
-        where votes are hard), a pixel by what is blended in it. `iou` is the mean over objects of
+        where votes are hard), a pixel by the splats blended in it. `iou` is the mean over objects of
         Σ min(share, mask) / Σ max(share, mask); the loss is 1 - iou.
         """
         labels = lift_masks(
@@ -118,8 +118,8 @@ def voting(scene: Scene, *, temperature: float | None = None) -> Voting:
     check_ids_occur(inputs.ids, inputs.views.masks)
     masks, number = _compact(inputs.views.masks, inputs.ids.values())
     views = eqx.tree_at(lambda v: v.masks, inputs.views, masks)
-    if {"train", "test"} <= set(views.splits):
-        train, held = views.subset("train"), views.subset("test")
+    train, held = views.training, views.held_out
+    if held is not None and "train" in views.splits:
         shown, hidden = (train.cameras, train.masks), (held.cameras, held.masks)
     else:
         every = np.arange(len(views.cameras)) % 4 == 3

@@ -1,4 +1,4 @@
-"""Cases of docs/results/VERIFICATION.md in their cheapest form; a tolerance is the figure seen there and some room."""
+"""Cases of docs/results/VERIFICATION.md in their cheapest form; each tolerance is the figure there and some room."""
 
 import math
 

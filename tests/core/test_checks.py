@@ -15,10 +15,12 @@ from hypothesis import strategies as st
 from scenes import ball
 
 from pigjax import io
-from pigjax.core.camera import look_at, stack_cameras
-from pigjax.core.errors import InputError, SceneError
-from pigjax.mpm.materials import LIMITS, PRESETS, Parameters
+from pigjax.core.arrays import as_real
+from pigjax.core.camera import Camera, look_at, orbit, stack_cameras
+from pigjax.core.errors import InputError, MissingFileError, SceneError
+from pigjax.mpm.materials import LIMITS, PRESETS, Material, Parameters, material_table
 from pigjax.mpm.transfers import KERNELS
+from pigjax.reconstruction.train import FitConfig
 from pigjax.scene import load_scene, plan, scene_from
 from pigjax.scene.decode import Section, decode, numbers_of
 from pigjax.scene.schema import Scene, SimulationSpec
@@ -223,3 +225,48 @@ def test_tables_of_limits_and_choices_cover_what_there_is():
     assert set(LIMITS) == {*Parameters.__dataclass_fields__, "bulk"}
     assert set(KERNELS) == {"quadratic", "cubic"}
     assert PRESETS
+
+
+@pytest.mark.parametrize("number", [np.int64(10**10), np.uint64(2**63), [10**10], 10**10])
+def test_integers_beyond_32_bits_become_real_and_are_not_wrapped(number):
+    wanted = np.float32(np.ravel(number)[0])
+    np.testing.assert_array_equal(np.ravel(as_real(number)), [wanted])
+    halved = Camera(np.eye(4), np.array([4, 4]), np.array([2, 2]), 4, 4).resized(2, 2)
+    np.testing.assert_array_equal(halved.focal, [2.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: orbit(np.zeros(3), radius=1.0, elevation=0.0, frames=2.5, focal=1.0, width=4, height=4),
+        lambda: look_at((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), focal=1.0, width=True, height=4),
+        lambda: look_at((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), focal=1.0, width=2**40, height=4),
+        lambda: material_table([Material(model="fixed_corotated", density=1.0, young=np.ones(2), poisson=0.1)]),
+        lambda: FitConfig(splats=4, start_splats=99),
+    ],
+)
+def test_numbers_of_another_kind_are_refused(call):
+    with pytest.raises(InputError, match=r"frames|width|young|start_splats"):
+        call()
+
+
+def test_an_aim_at_nothing_and_an_object_named_twice_are_refused():
+    aim = {"function": "aim", "options": {"object": "duck", "target": [math.nan] * 3}}
+    with pytest.raises(SceneError, match=r"objective\.options\.target = .*nan.*: give a number for one axis"):
+        decode({**STUDY, "objective": aim}, Study).objective.check()
+    with pytest.raises(SceneError, match=r"only: an object is named twice"):
+        decode({**STUDY, "only": ["duck", "duck"]}, Study)
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "a\0b"])
+def test_paths_that_no_file_can_have_are_missing_files(tmp_path, name):
+    with pytest.raises(MissingFileError):
+        load_scene(tmp_path / name)
+    with pytest.raises(MissingFileError):
+        objective_of(f"{name}.py:f", {}, tmp_path)
+    with pytest.raises(MissingFileError):
+        objective_of("video", {"target": name}, tmp_path)
+    (tmp_path / "masks").mkdir()
+    with pytest.raises(MissingFileError):
+        io.load_masks(tmp_path / "masks", [name], (4, 4))
+    assert io.file_digest(tmp_path / name) == "missing"

@@ -266,3 +266,19 @@ def test_bad_input_is_named(seeded):
     for scene_, ids, materials, options, message in cases:
         with pytest.raises(InputError, match=message):
             seed_particles(scene_, ids, materials, **options)
+
+
+def test_only_what_moves_is_written(seeded):
+    """Colours and opacities are those of the scene, untouched, and so is every row of a Gaussian at rest."""
+    gaussians, _, particles, _ = seeded
+    gaussians = eqx.tree_at(lambda g: g.sh, gaussians, jnp.zeros((len(gaussians), 4, 3)).at[:, 2].set(0.3))
+    moved = eqx.tree_at(lambda p: (p.x, p.F_visual), particles, (particles.x + 0.1, 1.1 * particles.F_visual))
+    posed, rest = deform(gaussians, moved, ClampParams()), as_splats(gaussians)
+    assert posed.sh is gaussians.sh
+    np.testing.assert_array_equal(posed.opacities, rest.opacities)
+    still = np.setdiff1d(np.arange(len(gaussians)), np.asarray(particles.gaussian))
+    assert len(still) >= BACKGROUND
+    np.testing.assert_array_equal(posed.means[still], rest.means[still])
+    np.testing.assert_array_equal(posed.factors[still], rest.factors[still])
+    np.testing.assert_array_equal(posed.sh_rotations[still], np.broadcast_to(np.eye(3), (len(still), 3, 3)))
+    assert (np.asarray(posed.means) != np.asarray(rest.means)).any(1).sum() == len(gaussians) - len(still)

@@ -7,8 +7,9 @@ import jax
 import numpy as np
 
 from pigjax.clamp import ClampParams
+from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
-from pigjax.mpm import SimConfig
+from pigjax.mpm import Grid, SimConfig
 from pigjax.mpm.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.materials import Material
@@ -18,7 +19,8 @@ from pigjax.splat import RenderConfig
 from pigjax.study.optimize import Bounds
 
 HUGE = (1e30, 2**40, 10**400)
-VALUES = (math.nan, math.inf, -math.inf, -1, 0, *HUGE, 1e-45, "text", [], {}, None, True, (math.nan,) * 3)
+ODD = (np.array(["a"]), np.array([None]), [[1], [1, 2]], 1 + 2j, np.ones((2, 5)), jax.random.key(0), np.uint64(2**63))
+VALUES = (math.nan, math.inf, -math.inf, -1, 0, *HUGE, 1e-45, "text", [], {}, None, True, (math.nan,) * 3, *ODD)
 ZERO, ONE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 MADE = [
     (RenderConfig, {}),
@@ -34,6 +36,8 @@ MADE = [
     (Sphere, {"centre": ZERO, "radius": 1.0}),
     (Capsule, {"start": ZERO, "end": ONE, "radius": 1.0}),
     (Cylinder, {"start": ZERO, "end": ONE, "radius": 1.0}),
+    (Grid, {"origin": ZERO, "dx": 1.0, "shape": (8, 8, 8)}),
+    (Camera, {"world_to_cam": np.eye(4), "focal": np.ones(2), "centre": np.ones(2), "width": 4, "height": 4}),
     (SampledDistance, {"samples": np.zeros((2, 2, 2)), "origin": ZERO, "dx": 1.0}),
 ]
 
@@ -53,7 +57,8 @@ def fault(made, field, value):
 for cls, base in MADE:
     for field in dataclasses.fields(cls):
         for value in VALUES:
-            where = f"{cls.__name__}.{field.name} = {str(value)[:30] if value not in HUGE else 'huge'}"
+            huge = isinstance(value, int | float) and value in HUGE
+            where = f"{cls.__name__}.{field.name} = {'huge' if huge else str(value)[:30]}"
             try:
                 said = fault(cls(**{**base, field.name: value}), field, value)
             except InputError as error:

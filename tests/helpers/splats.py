@@ -1,10 +1,13 @@
-"""Random splats, their camera, and the dense picture of them."""
+"""Random splats, their camera, and the picture of them by the plain reference renderer."""
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from dense import dense_render
 
 from pigjax.core.camera import Camera, look_at
 from pigjax.splat import Gaussians
+from pigjax.splatting import reference
 
 
 def make_scene(count=60, seed=0, width=40, height=28, degree=3, spread=1.0):
@@ -22,19 +25,18 @@ def make_scene(count=60, seed=0, width=40, height=28, degree=3, spread=1.0):
 
 
 def gaussians_of(scene):
-    logit = np.log(scene["opacities"] / (1 - scene["opacities"]))
-    return Gaussians(scene["means"], np.log(scene["scales"]), scene["quats"], logit, scene["sh"])
+    with np.errstate(divide="ignore"):
+        logit, log_scales = np.log(scene["opacities"] / (1 - scene["opacities"])), np.log(scene["scales"])
+    return Gaussians(scene["means"], log_scales, scene["quats"], logit, scene["sh"])
 
 
-def dense(scene, camera, config, **kwargs):
-    values = [np.asarray(v, np.float64) for v in (camera.world_to_cam, camera.focal, camera.centre)]
-    return dense_render(
-        **scene,
-        view=values[0],
-        focal=values[1],
-        centre=values[2],
-        width=camera.width,
-        height=camera.height,
-        config=config,
-        **kwargs,
-    )
+_draw = eqx.filter_jit(reference.render)
+
+
+def dense(scene, camera, config, *, tau=0.5, weights=None):
+    """rgb, alpha, mean depth, surface depth and weights [h w m] of `splatting.reference` in float64."""
+    with jax.enable_x64(True):
+        gaussians = gaussians_of({name: np.asarray(values, np.float64) for name, values in scene.items()})
+        camera = jax.tree.map(lambda values: jnp.asarray(values, jnp.float64), camera)
+        features = None if weights is None else jnp.asarray(weights, jnp.float64)
+        return jax.tree.map(np.asarray, _draw(gaussians, camera, config, features=features, tau_T=tau))

@@ -259,9 +259,13 @@ def test_georeferenced_cameras_are_refused_with_their_offset(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         load_cameras(transforms(tmp_path, moved([100.0, 200.0, 50.0])))
-    with pytest.raises(InputError, match=r"cameras lie around \(450000\.5, 5400000, 100\), .*subtract this offset"):
-        load_cameras(transforms(tmp_path, moved([4.5e5, 5.4e6, 100.0])))
-    with pytest.warns(UserWarning, match="subtract this offset"):
+    far, offered = [4.5e5, 5.4e6, 100.0], r"give origin=\(450000, 5400000, 0\), .*--origin 450000 5400000 0"
+    with pytest.raises(InputError, match=rf"cameras lie around \(450000\.5, 5400000, 100\), .*{offered}"):
+        load_cameras(transforms(tmp_path, moved(far)))
+    with pytest.raises(InputError, match=offered):  # of the file, whatever was subtracted
+        load_cameras(tmp_path, origin=(1e5, 0.0, 0.0))
+    load_cameras(tmp_path, origin=(450_000, 5_400_000, 0))
+    with pytest.warns(UserWarning, match="give origin="):
         load_cameras(transforms(tmp_path, moved([3000.0, 0.0, 0.0])))
     with pytest.raises(InputError, match="cameras lie around"):
         load_cameras(transforms(tmp_path, moved([1e300, 0.0, 0.0])))

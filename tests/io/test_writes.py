@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
 
 import equinox as eqx
@@ -467,6 +468,10 @@ BAD_LABELS = {
     "no share": {"confidence": np.full(3, np.inf)},
     "complex": {"confidence": np.zeros(3, complex)},
     "lengths": {"confidence": np.zeros(2)},
+    "no column": {"object_id": np.array([0, 1, 7])},
+    "ids twice": {"ids": np.array([0, 1, 1, 2])},
+    "ids too far": {"ids": np.array([0, 1, 2, 2**40])},
+    "ids below": {"ids": np.array([-3, 0, 1, 2])},
 }
 
 
@@ -487,6 +492,39 @@ def test_archives_hold_no_python_objects(tmp_path):
     np.save(tmp_path / "a.npy", np.array([{}], object), allow_pickle=True)
     with pytest.raises(InputError, match="it holds Python objects"):
         io.load_array(tmp_path / "a.npy", "array")
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_a_name_written_twice_is_refused(tmp_path):
+    """In an archive and in JSON the second would hide the first."""
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        for number in range(2):
+            with archive.open("a.npy", "w") as file:
+                np.lib.format.write_array(file, np.full(3, number))
+    with pytest.raises(InputError, match="two of its arrays have one name"):
+        io.load_arrays(tmp_path / "a.npz", "table", remedy="sweep again")
+    (tmp_path / "names.json").write_text('{"1": "duck", "2": "table", "1": "ball"}')
+    with pytest.raises(InputError, match=r"names\.json: .*the key '1' is written twice"):
+        io.load_names(tmp_path / "names.json")
+
+
+@pytest.mark.parametrize("breaks", ["\n", "\r", "\x85", "\u2028"])
+def test_errors_are_one_line_whatever_the_name(tmp_path, breaks):
+    with pytest.raises(InputError) as caught:
+        io.read_json(tmp_path / f"a{breaks}b.json")
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_folder_of_a_refused_command_is_free(segmenting, monkeypatch, tmp_path):
+    def refuse(*arguments, **options):
+        raise InputError("weighting = 'x'")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(objects, "lift", refuse)
+        with pytest.raises(InputError, match="weighting"):
+            segmenting(tmp_path / "out", {1: "wrong"})
+    segmenting(tmp_path / "out", {1: "duck"})
+    assert (tmp_path / "out" / "labels.npz").is_file()
 
 
 @pytest.mark.parametrize("name", ["file", "allow_pickle", "a/b", "../x", "é"])

@@ -10,12 +10,12 @@ import pytest
 
 from pigjax.core.errors import InputError
 from pigjax.mls_mpm import SimConfig, rollout
-from pigjax.mpm import Grid, fit_grid, make_particles, vast_grid
-from pigjax.mpm import active_grid as boxes
-from pigjax.mpm.active_grid import Fit
+from pigjax.mpm import Grid, active_grid, fit_grid, make_particles, vast_grid
+from pigjax.mpm.active_grid import ActiveGrid, box_for
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.materials import Material, material_table, preset
+from pigjax.mpm.program import StepInputs
 from pigjax.mpm.timestep import stable_dt
 
 DX = 1 / 16
@@ -54,18 +54,10 @@ def test_a_box_that_matter_outruns_is_made_larger(x64, monkeypatch):
     """Matter that free flight would not have carried so far: thrown back by a moving wall."""
     particles = two_cubes()
     bat = Plane(point=jnp.asarray([1.2, 0, 0]), normal=jnp.asarray([1.0, 0, 0]), velocity=jnp.asarray([8.0, 0, 0]))
-    fit, config = Fit(slack=0.0), SimConfig(substeps=40)
-    step = {
-        "dt": jnp.asarray(0.02 / 40),
-        "gravity": jnp.zeros(3),
-        "colliders": (bat,),
-        "contact": None,
-        "start": jnp.zeros(()),
-        "frames": 1,
-        "substeps": 40,
-    }
-    monkeypatch.setattr(boxes, "_ROOM", 1.0)
-    moved, _, health = fit.frame(particles, vast_grid(DX), TABLE, config, 1, **step)
+    active, config = ActiveGrid(slack=0.0), SimConfig(substeps=40)
+    inputs = StepInputs(jnp.asarray(0.02 / 40), 40, jnp.zeros(3), jnp.zeros(()), (bat,))
+    monkeypatch.setattr(active_grid, "_ROOM", 1.0)
+    moved, _, health = active.frame(particles, vast_grid(DX), TABLE, config, 1, inputs)
     assert int(health.escaped) == 0
     whole, _, _ = rollout(
         particles, fit_grid(particles.x, DX, margin=0.7), TABLE, config, frames=1, frame_dt=0.02, gravity=(0, 0, 0),
@@ -190,16 +182,16 @@ def test_a_box_holds_the_motion_that_it_was_sized_for_and_is_none_where_it_would
     )  # fmt: skip
     end, path, _ = jax.jit(lambda still: run(still, config=SimConfig(substeps=80, devices=1)))(still)
     vast = Grid(jnp.zeros(3), jnp.asarray(DX), (64, 64, 64))
-    box = boxes.box_for([(still, path, 0.04, (0.0, 0.0, 0.0))], ELASTIC, vast)
+    box = box_for([(still, path, 0.04, (0.0, 0.0, 0.0))], ELASTIC, vast)
     assert max(box) < 32
     boxed, _, health = jax.jit(lambda still: run(still, config=SimConfig(substeps=80, devices=1, box=box)))(still)
     assert int(health.escaped) == 0
     assert float(jnp.abs(path.x[0] - still.x).max()) > 3 * DX  # hit in the first frame
     np.testing.assert_allclose(boxed.x, end.x, atol=1e-8)
-    assert boxes.box_for([(still, path, 0.04, (0.0, 0.0, 0.0))], ELASTIC, fit_grid(still.x, DX)) is None
+    assert box_for([(still, path, 0.04, (0.0, 0.0, 0.0))], ELASTIC, fit_grid(still.x, DX)) is None
     of_one = make_particles(jnp.ones((1, 3)), volume=1e-4, table=ELASTIC)
     at_rest = eqx.tree_at(lambda p: (p.x, p.v), path, (jnp.ones((2, 1, 3)), jnp.zeros((2, 1, 3))))
-    assert boxes.box_for([(of_one, at_rest, 0.04, (0.0, 0.0, 0.0))], ELASTIC, vast) == (8, 8, 8)
+    assert box_for([(of_one, at_rest, 0.04, (0.0, 0.0, 0.0))], ELASTIC, vast) == (8, 8, 8)
 
 
 def test_nodes_are_where_they_are_wherever_the_grid_begins():

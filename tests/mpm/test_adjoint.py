@@ -20,12 +20,16 @@ from pigjax.mpm.materials import Material, material_table
 
 
 class Worst(NamedTuple):
-    """A tally: the largest number met."""
+    """A health: the largest number met."""
 
     most: jax.Array
 
-    def worse(self, other):
+    def combine(self, other):
         return Worst(jnp.maximum(self.most, other.most))
+
+
+def perfect():
+    return Worst(jnp.zeros(()))
 
 
 def begin(shared, state):
@@ -45,7 +49,7 @@ def end(shared, state, between, number):
 
 
 def steps(length, block, keep, wide=False):
-    return Steps(wide_begin if wide else begin, end, length, block, keep, passive={"x": False, "weight": True})
+    return Steps(wide_begin if wide else begin, end, perfect, length, block, keep, passive={"x": False, "weight": True})
 
 
 def inputs():
@@ -58,7 +62,7 @@ def plainly(length, shared, state, first):
     worst = Worst(jnp.zeros(()))
     for i in range(length):
         state, own = end(shared, state, begin(shared, state), first + i)
-        worst = worst.worse(own)
+        worst = worst.combine(own)
     return state, worst
 
 
@@ -79,10 +83,10 @@ def test_derivatives_and_values_are_those_of_the_steps_written_out(length, block
     with jax.enable_x64(True):
         shared, state = inputs()
         own = steps(length, min(block, length), keep, wide)
-        nothing, first = Worst(jnp.zeros(())), jnp.int32(first)
+        first = jnp.int32(first)
 
         def ours(shared, state):
-            return run_steps(own, shared, state, first, nothing)
+            return run_steps(own, shared, state, first)
 
         def theirs(shared, state):
             return plainly(length, shared, state, first)
@@ -97,11 +101,11 @@ def test_derivatives_and_values_are_those_of_the_steps_written_out(length, block
 
 def test_derivatives_survive_vmap(x64):
     shared, state = inputs()
-    nothing, first = Worst(jnp.zeros(())), jnp.int32(0)
+    first = jnp.int32(0)
     many = jax.tree.map(lambda leaf: jnp.stack([leaf, 1.1 * leaf, 0.9 * leaf]), state)
 
     def own(state):
-        return gradients(lambda *a: run_steps(steps(7, 3, True), *a, first, nothing), shared, state)
+        return gradients(lambda *a: run_steps(steps(7, 3, True), *a, first), shared, state)
 
     apart = [own(jax.tree.map(lambda leaf, k=k: leaf[k], many)) for k in range(3)]
     together = jax.vmap(own)(many)
@@ -119,8 +123,8 @@ def test_what_is_kept_is_not_computed_anew(x64, keep, wide, anew):
 
     shared, state = inputs()
     own = steps(10, 4, keep)._replace(begin=counted)
-    nothing, first = Worst(jnp.zeros(())), jnp.int32(0)
-    gradients(lambda *a: run_steps(own, *a, first, nothing), shared, state)
+    first = jnp.int32(0)
+    gradients(lambda *a: run_steps(own, *a, first), shared, state)
     jax.effects_barrier()
     linearized = 10  # once for each derivative of a step
     assert len(seen) == 10 + anew + linearized
@@ -149,7 +153,7 @@ def test_only_what_is_asked_for_is_differentiated(x64):
     own = steps(6, 2, True)._replace(end=step)
 
     def total(x):
-        after, _ = run_steps(own, shared, state | {"x": x}, jnp.int32(0), Worst(jnp.zeros(())))
+        after, _ = run_steps(own, shared, state | {"x": x}, jnp.int32(0))
         return after["x"].sum()
 
     def written_out(x):
@@ -162,13 +166,13 @@ def test_only_what_is_asked_for_is_differentiated(x64):
 
 def test_numbers_of_python_have_derivatives_too(x64):
     shared, state = inputs()
-    nothing, first = Worst(jnp.zeros(())), jnp.int32(0)
+    first = jnp.int32(0)
 
     def total(gain, run):
         return run(shared | {"gain": gain}, state)[0]["x"].sum()
 
     def ours(*both):
-        return run_steps(steps(5, 2, True), *both, first, nothing)
+        return run_steps(steps(5, 2, True), *both, first)
 
     expected = jax.grad(total)(0.7, lambda *both: plainly(5, *both, first))
     np.testing.assert_allclose(jax.grad(total)(0.7, ours), expected, rtol=1e-12)
@@ -185,7 +189,7 @@ def test_integers_of_the_state_pass(x64):
     own = steps(7, 3, False)._replace(end=counting, passive={"x": False, "weight": True, "count": False})
 
     def ours(shared, state):
-        return run_steps(own, shared, state | {"count": jnp.int32(2)}, jnp.int32(0), Worst(jnp.zeros(())))
+        return run_steps(own, shared, state | {"count": jnp.int32(2)}, jnp.int32(0))
 
     found = gradients(ours, shared, state)
     expected = gradients(lambda *both: plainly(7, *both, jnp.int32(2)), shared, state)

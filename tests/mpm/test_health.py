@@ -16,9 +16,8 @@ from pigjax.mpm import Grid, Health, fit_grid, make_particles, vast_grid
 from pigjax.mpm.materials import Material, material_table
 from pigjax.mpm.timestep import (
     choose_substeps,
-    first_substeps,
-    frame_substeps,
     stable_dt,
+    substep_rule,
 )
 from pigjax.scene.health import health_record, remarks, summary
 
@@ -106,23 +105,25 @@ def test_substeps_of_a_long_fall_grow_with_its_speed():
     steps = {"frame_dt": 1 / 24, "gravity": (0.0, 0.0, -9.81)}
     grid, table = vast_grid(DX), material_table([Material("fixed_corotated", density=1000.0, young=2e3, poisson=0.3)])
     most = choose_substeps(cube(), grid, table, SimConfig(), frames=48, **steps)
-    config, first = first_substeps(cube(), grid, table, SimConfig(), frames=48, **steps)
+    rule = substep_rule(cube(), grid, table, SimConfig(), frames=48, **steps)
+    first = rule.first
     assert 2 * first < most
     for frame in (0, 20, 47):
         speed = 9.81 * frame / 24
-        taken = frame_substeps(first, cube((0, 0, -speed)), grid, table, config, frame=frame, **steps)
-        limit = float(stable_dt(table, grid, max_speed=speed + 9.81 / 24, cfl=config.cfl))
+        taken = rule.of_frame(cube((0, 0, -speed)), frame)
+        limit = float(stable_dt(table, grid, max_speed=speed + 9.81 / 24, cfl=rule.config.cfl))
         assert first <= taken
         assert 1 / 24 / taken <= limit * (1 + 1e-5)
         assert taken <= max(first, 1.51 / 24 / limit + 1)
-    assert frame_substeps(first, cube((0, 0, -9.81 * 47 / 24)), grid, table, config, frame=47, **steps) >= 0.88 * most
+    assert rule.of_frame(cube((0, 0, -9.81 * 47 / 24)), 47) >= 0.88 * most
 
 
 def test_the_walls_of_a_small_grid_bound_a_fall_and_its_substeps():
     steps = {"frames": 48, "frame_dt": 1 / 24, "gravity": (0.0, 0.0, -9.81)}
     small = fit_grid(CUBE, DX)
-    config, first = first_substeps(cube(), small, TABLE, SimConfig(), **steps)
-    assert first == choose_substeps(cube(), small, TABLE, config, **steps)
+    rule = substep_rule(cube(), small, TABLE, SimConfig(), **steps)
+    assert not rule.adaptive
+    assert rule.first == choose_substeps(cube(), small, TABLE, rule.config, **steps)
 
 
 def test_a_step_decides_its_integrator_or_says_that_it_cannot():

@@ -12,9 +12,10 @@ from pigjax import io
 from pigjax.core.errors import InputError, SceneError
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, make_particles, vast_grid
-from pigjax.mpm.active_grid import Fit
+from pigjax.mpm.active_grid import ActiveGrid
 from pigjax.mpm.colliders import Plane, Sphere
 from pigjax.mpm.materials import Material, material_table
+from pigjax.mpm.program import StepInputs
 from pigjax.mpm.sleep import Sleep, Sleeper
 from pigjax.scene import run_scene, scene_from
 
@@ -43,13 +44,13 @@ def simulate(particles, *, frames, sleep=None, gravity=NO_GRAVITY, frame_dt=0.02
 @pytest.fixture
 def simulated(monkeypatch):
     """Particles of each frame that was computed."""
-    counts, whole = [], Fit.frame
+    counts, whole = [], ActiveGrid.frame
 
-    def counted(self, particles, *args, **step):
+    def counted(self, particles, *args):
         counts.append(len(particles))
-        return whole(self, particles, *args, **step)
+        return whole(self, particles, *args)
 
-    monkeypatch.setattr(Fit, "frame", counted)
+    monkeypatch.setattr(ActiveGrid, "frame", counted)
     return counts
 
 
@@ -78,16 +79,15 @@ def test_what_gets_farther_than_its_speed_told_wakes_others_in_the_same_frame(x6
     pair = cubes([(0, 0, 0), (5.2, 0, 0)], [(0, 0, 0)] * 2)
     squeezed = jnp.where(jnp.arange(128)[:, None, None] >= 64, 0.35, 1.0) * pair.F
     pair = eqx.tree_at(lambda p: p.F, pair, squeezed)
-    step = {"dt": jnp.asarray(0.05 / 128), "gravity": jnp.zeros(3), "colliders": (), "contact": None}
-    step |= {"start": jnp.zeros(()), "frames": 1, "substeps": 128}
+    inputs = StepInputs(jnp.asarray(0.05 / 128), 128, jnp.zeros(3), jnp.zeros(()))
     sleeper = Sleeper(settings=Sleep(), body=np.asarray(pair.body), slack=50.0)  # the whole domain: one box for all
     sleeper.asleep[0], sleeper.still[0] = True, 9
     config = SimConfig(devices=1)
     domain = Grid(jnp.full(3, -6 * DX), jnp.asarray(DX), (20, 16, 16))
-    moved, _, _ = sleeper.frame(pair, domain, TABLE, config, 1, **step)
+    moved, _, _ = sleeper.frame(pair, domain, TABLE, config, 1, inputs)
     assert simulated == [64, 128]
     assert not sleeper.asleep.any()
-    plain, _, _ = Fit(slack=50.0).frame(pair, domain, TABLE, config, 1, **step)
+    plain, _, _ = ActiveGrid(slack=50.0).frame(pair, domain, TABLE, config, 1, inputs)
     np.testing.assert_allclose(moved.x, plain.x, atol=1e-9)
     assert float(jnp.abs(plain.x[:64] - pair.x[:64]).max()) > 0.01 * DX
 
@@ -125,13 +125,12 @@ def test_a_block_let_go_in_the_air_does_not_fall_asleep_there(x64):
 
 def test_a_simulation_goes_on_from_what_the_sleeper_remembers(x64):
     row = cubes([(0, 0, 0), (2, 0, 0), (14, 0.3, 0.2)], [(0, 0, 0), (0, 0, 0), (-2.0, 0, 0)])
-    step = {"dt": jnp.asarray(0.02 / 16), "gravity": jnp.zeros(3), "colliders": (), "contact": None}
-    step |= {"frames": 1, "substeps": 16}
+    inputs = StepInputs(jnp.asarray(0.02 / 16), 16, jnp.zeros(3), jnp.zeros(()))
 
     def run(sleeper, particles, frames):
         for frame in frames:
-            now = {**step, "start": jnp.asarray(0.02 * frame)}
-            particles, *_ = sleeper.frame(particles, vast_grid(DX), TABLE, SimConfig(devices=1), 1, **now)
+            now = inputs._replace(start=jnp.asarray(0.02 * frame))
+            particles, *_ = sleeper.frame(particles, vast_grid(DX), TABLE, SimConfig(devices=1), 1, now)
         return particles
 
     def fresh():

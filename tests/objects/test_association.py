@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
-from segmentation.association import score, spoil
-from segmentation.tabletop import load_tabletop
 
+from benchmarks.segmentation.association import score, spoil
+from benchmarks.segmentation.tabletop import load_tabletop
 from pigjax.core.camera import orbit
 from pigjax.core.errors import InputError
 from pigjax.objects.association import associate_masks, compact_ids

@@ -33,9 +33,9 @@ from pigjax.cli.evaluating import evaluate_files
 from pigjax.core.errors import InputError, MissingFileError
 from pigjax.core.metrics import MaskScores
 from pigjax.io import load_dataset, save_masks, write_image
-from pigjax.objects.evaluation import LEVELS, evaluate_labels, ground_prompts, pixel_ids, reference_view
+from pigjax.objects.evaluation import LEVELS, evaluate_labels, ground_prompts, reference_view
 from pigjax.objects.overlay import comparison_sheet
-from pigjax.segmentation import Labels
+from pigjax.segmentation import Labels, pixel_ids
 
 
 def iou(a, b):
@@ -184,6 +184,24 @@ def test_command_prints_the_scores_of_each_layout(tmp_path, layout):
         assert green == 16 * (near + far)  # all is right, each pixel 4x4
 
 
+def test_a_georeferenced_data_set_is_scored_once_its_origin_is_given(tmp_path):
+    write_folder(tmp_path, "views")
+    gaussians, labels = scene()
+    origin = (500_000.0, 4_600_000.0, 100.0)
+    save_ply(tmp_path / "scene.ply", gaussians, origin=origin)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in content["frames"]:
+        for row, offset in zip(frame["transform_matrix"], origin):
+            row[3] += offset
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"give origin=\(500000, 4600000, "):
+        load_dataset(tmp_path, "views")
+    votes, confidence = np.zeros((len(gaussians), 1)), np.zeros(len(gaussians))
+    io.save_labels(tmp_path / "labels.npz", labels.object_id, votes, confidence, scene="of the file")
+    scores = run(tmp_path, "views", "--labels", tmp_path / "labels.npz", "--origin", *origin)
+    assert scores["levels"]["visible"]["mean_iou"] == pytest.approx(1.0)
+
+
 def test_prompts_masks_labels_and_reference_may_be_given(tmp_path):
     write_folder(tmp_path, "lerf-mask")
     (tmp_path / "prompts.json").write_text('{"near": 1, "far": 2}')
@@ -295,7 +313,7 @@ def test_labels_and_prompts_that_do_not_fit_are_named(tmp_path):
         evaluate()
     path = tmp_path / "labels.npz"
     path.write_bytes(b"PK\x03\x04")
-    with pytest.raises(InputError, match=r"labels\.npz: not the labels\.npz of 'pigjax segment'"):
+    with pytest.raises(InputError, match=r"labels\.npz: not a readable labels\.npz of 'pigjax segment'"):
         evaluate(labels=path)
     np.savez(path, object_id=np.ones(3, int), votes=np.ones((3, 2)), confidence=np.ones(3))
     with pytest.raises(InputError, match=rf"labels 3 Gaussians, the scene has {len(gaussians)}"):

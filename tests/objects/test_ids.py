@@ -14,9 +14,9 @@ from PIL import Image
 
 from pigjax.core.camera import look_at, stack_cameras
 from pigjax.core.errors import InputError, SceneError
-from pigjax.io import id_named, load_masks, load_names
+from pigjax.io import id_named, load_masks, load_names, read_image
 from pigjax.objects.lifting import lift
-from pigjax.objects.overlay import colours_of, id_colours, id_image, overlay
+from pigjax.objects.overlay import colours_of, id_colours, overlay
 from pigjax.scene.plan import Inputs, _id_of, segment
 from pigjax.scene.schema import load_scene
 from pigjax.segmentation import lift_masks
@@ -116,6 +116,21 @@ def test_pictures_that_hold_no_ids_are_refused(tmp_path, mode):
         load_masks(tmp_path, ["a"], SIZE)
 
 
+@pytest.mark.parametrize("kind", ["EPS", "PCX"])
+def test_files_of_other_kinds_are_not_opened_whatever_their_name(tmp_path, kind):
+    """Pillow starts Ghostscript for EPS."""
+    Image.new("RGB", SIZE).save(tmp_path / "a.png", format=kind)
+    with pytest.raises(InputError, match=r"a\.png: not a readable image \(none of PNG, JPEG"):
+        read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("background", [np.nan, 7.0, (0.0, -1.0, 0.0)])
+def test_a_background_that_is_no_colour_is_refused(tmp_path, background):
+    Image.new("RGBA", SIZE).save(tmp_path / "a.png")
+    with pytest.raises(InputError, match=r"a\.png: background = .*: must be"):
+        read_image(tmp_path / "a.png", background=background)
+
+
 @pytest.mark.parametrize("far", [60000, 2_000_000_000])
 def test_votes_take_memory_by_the_ids_that_occur(far):
     gaussians, cameras, masks = pair()
@@ -172,8 +187,6 @@ def test_colours_of_ids_far_apart_are_those_of_the_list():
     np.testing.assert_array_equal(colours_of(np.arange(-1, 40)), id_colours(40)[np.maximum(np.arange(-1, 40), 0)])
     ids = np.array([[0, 2_000_000_000]])
     assert (overlay(np.zeros((1, 2, 3)), ids)[0, 0] == 0).all()
-    weights = jnp.asarray([[[0.1, 0.9], [0.2, 0.1]]])
-    assert id_image(weights, ids=np.array([0, 2_000_000_000])).tolist() == [[2_000_000_000, 0]]
 
 
 @pytest.mark.parametrize(

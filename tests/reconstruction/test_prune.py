@@ -1,4 +1,4 @@
-"""Contributions against the dense compositor, and pictures of what is left."""
+"""Contributions against the reference renderer, and pictures of the Gaussians that are kept."""
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,6 @@ def test_hidden_splats_go_first_and_the_picture_stays():
     np.testing.assert_allclose(render(kept, camera).rgb, render(gaussians, camera).rgb, atol=1e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_fewer_splats_cost_less_picture_the_more_they_contribute():
     scene, camera = make_scene(count=200, degree=0)

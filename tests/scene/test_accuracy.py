@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tradeoff.errors import displacement_error, distance_travelled, enlarged, share_right, video_psnr
-from tradeoff.points import Point, in_turn, pareto, table
 from typer.testing import CliRunner
 
+from benchmarks.common.timing import in_turn
+from benchmarks.tradeoff.errors import displacement_error, distance_travelled, enlarged, share_right, video_psnr
+from benchmarks.tradeoff.points import Point, pareto, table
 from pigjax.cli import app
 from pigjax.core.camera import project
 from pigjax.core.errors import SceneError

@@ -228,7 +228,7 @@ def test_drawing_anew_simulates_nothing_and_another_scene_is_refused(finished, f
 def test_a_simulation_that_breaks_down_keeps_its_good_frames(folder, tmp_path, monkeypatch):
     import pigjax.scene.run as run_module
 
-    whole = run_module.Fit.frame
+    whole = run_module.ActiveGrid.frame
 
     def poisoned(self, *args, **kwargs):
         moved, trajectory, health = whole(self, *args, **kwargs)
@@ -238,7 +238,7 @@ def test_a_simulation_that_breaks_down_keeps_its_good_frames(folder, tmp_path, m
         return moved, trajectory, health
 
     poisoned.calls = 0
-    monkeypatch.setattr(run_module.Fit, "frame", poisoned)
+    monkeypatch.setattr(run_module.ActiveGrid, "frame", poisoned)
     with pytest.raises(SimulationError, match=r"frame 2 of 3: 3 particles became NaN.*states up to frame 1 are kept"):
         run_scene(scene_from(values(), folder=folder), tmp_path)
     assert io.load_state(tmp_path / "states", 1)["x"].shape
@@ -248,14 +248,14 @@ def test_a_simulation_that_breaks_down_keeps_its_good_frames(folder, tmp_path, m
 def test_colliders_move_on_from_frame_to_frame(folder, tmp_path, monkeypatch):
     import pigjax.scene.run as run_module
 
-    whole, starts = run_module.Fit.frame, []
+    whole, starts = run_module.ActiveGrid.frame, []
 
-    def watched(self, *args, start, **kwargs):
-        starts.append(float(start))
-        moved, trajectory, health = whole(self, *args, start=start, **kwargs)
+    def watched(self, *args):
+        starts.append(float(args[-1].start))
+        moved, trajectory, health = whole(self, *args)
         return moved, trajectory, replace(health, nonfinite=jnp.asarray(int(len(starts) == 3)))
 
-    monkeypatch.setattr(run_module.Fit, "frame", watched)
+    monkeypatch.setattr(run_module.ActiveGrid, "frame", watched)
     lift = {"point": [0, 0, -1], "normal": [0, 0, 1], "velocity": [0, 0, 0.1]}
     with pytest.raises(SimulationError):
         run_scene(scene_from(values(planes__lift=lift), folder=folder), tmp_path)

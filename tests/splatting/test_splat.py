@@ -1,4 +1,4 @@
-"""The renderer against a dense float64 compositor, gsplat's own numbers, and central differences."""
+"""The renderer against the plain reference in float64, gsplat's own numbers, and central differences."""
 
 from __future__ import annotations
 
@@ -15,18 +15,21 @@ from splats import dense, gaussians_of, make_scene
 import pigjax.splat as splat_module
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
-from pigjax.splat import Gaussians, RenderConfig, render, required_capacity, surface_depth
+from pigjax.core.linalg import quat_to_matrix
+from pigjax.splat import Gaussians, RenderConfig, Splats, render, required_capacity, surface_depth
+from pigjax.splatting import reference
 from pigjax.splatting.alpha import blend_chunk, running_sums, transmittances
-from pigjax.splatting.binning import Boxes, blend_config, count_pairs, front_to_back, list_pass, pairs_in_open_tiles
+from pigjax.splatting.binning import Boxes, bin_splats, blend_config, count_pairs, list_pass, pairs_in_open_tiles
 from pigjax.splatting.projection import project_splats
-from pigjax.splatting.types import OUTPUTS
+from pigjax.splatting.sh import sh_basis
+from pigjax.splatting.types import OUTPUTS, as_splats
 
 EXACT = RenderConfig(alpha_min=1e-7, transmittance_min=0.0)
 DEFAULT = RenderConfig()
 
 
 @pytest.mark.parametrize(("degree", "antialias"), [(0, False), (1, True), (2, False), (3, True)])
-def test_every_output_equals_the_dense_compositor(degree, antialias):
+def test_every_output_equals_the_reference(degree, antialias):
     scene, camera = make_scene(degree=degree, seed=degree)
     config = RenderConfig(antialias=antialias)
     membership = np.random.default_rng(1).random((60, 3))
@@ -54,7 +57,7 @@ def test_every_output_equals_the_dense_compositor(degree, antialias):
     assert frame.overflow == 0
 
 
-def test_exact_settings_equal_the_dense_compositor_with_the_same_thresholds_in_float64(x64):
+def test_exact_settings_equal_the_reference_with_the_same_thresholds_in_float64(x64):
     scene, camera = make_scene()
     frame = render(gaussians_of(scene), camera, EXACT, outputs=("rgb", "alpha"))
     rgb, alpha, *_ = dense(scene, camera, EXACT)
@@ -84,6 +87,21 @@ def gsplat_reference():
 
 # gsplat caps alpha at 0.999
 GSPLAT = RenderConfig(alpha_max=0.999)
+
+
+def test_the_reference_equals_gsplat(gsplat_reference):
+    """The oracle of all other tests against another implementation, of which it shares nothing."""
+    data, gaussians, camera = gsplat_reference
+    draw = jax.jit(lambda config: reference.render(gaussians, camera, config), static_argnums=0)
+    picture = draw(GSPLAT)
+    for name in ("rgb", "alpha"):
+        assert np.abs(getattr(picture, name) - data[name]).max() < 2e-5, name
+    assert np.abs(picture.depth * picture.alpha - data["depth_acc"]).max() < 1e-4
+    # where the transmittance passes within rounding of tau, either splat is the surface
+    same = np.isclose(np.nan_to_num(picture.surface_depth), data["surface_depth"], rtol=1e-5)
+    assert same.mean() > 0.999
+    antialiased = draw(replace(GSPLAT, antialias=True))
+    assert np.abs(antialiased.rgb - data["rgb_antialiased"]).max() < 2e-5
 
 
 def test_images_equal_gsplat(gsplat_reference):
@@ -187,6 +205,48 @@ def test_gradients_equal_central_differences(x64, smooth_loss, part):
 
     h = 1e-6
     np.testing.assert_allclose(np.sum(PARTS[part](gradient) * direction), (at(h) - at(-h)) / (2 * h), rtol=2e-5)
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+def test_gradients_equal_those_of_the_reference(x64, antialias):
+    """With the default thresholds, which both renderers differentiate as constants."""
+    scene, camera = make_scene(count=40, degree=2)
+    gaussians, config = gaussians_of(scene), RenderConfig(antialias=antialias)
+    weights = np.random.default_rng(6).normal(size=(28, 40, 8))
+
+    def loss(draw, gaussians, camera):
+        rgb, alpha, depth, features = draw(gaussians, camera, jnp.sin(gaussians.means))
+        return jnp.sum(jnp.concatenate([rgb, alpha[..., None], depth[..., None], features], -1) * weights)
+
+    def ours(gaussians, camera, features):
+        frame = render(gaussians, camera, config, outputs=("rgb", "alpha", "depth", "features"), features=features)
+        return frame.rgb, frame.alpha, frame.depth, frame.features
+
+    def plain(gaussians, camera, features):
+        picture = reference.render(gaussians, camera, config, features=features)
+        return picture.rgb, picture.alpha, picture.depth, picture.features
+
+    gradient, expected = (
+        jax.jit(jax.grad(lambda *inputs, draw=draw: loss(draw, *inputs), argnums=(0, 1)))(gaussians, camera)
+        for draw in (ours, plain)
+    )
+    for one, other in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-10 * np.abs(other).max())
+
+
+def test_spherical_harmonics_are_those_of_scipy(x64):
+    """In 3DGS' order: l, then m from -l to l; the functions of scipy carry the Condon-Shortley phase, as 3DGS does."""
+    from scipy.special import sph_harm_y
+
+    directions = np.random.default_rng(0).normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    theta, phi = np.arccos(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])
+    columns = []
+    for degree in range(4):
+        for m in range(-degree, degree + 1):
+            y = sph_harm_y(degree, abs(m), theta, phi)
+            columns.append(y.real if m == 0 else np.sqrt(2) * (y.real if m > 0 else y.imag))
+    np.testing.assert_allclose(sh_basis(jnp.asarray(directions), 3), np.stack(columns, 1), atol=1e-13)
 
 
 def test_forward_mode_and_hessian_agree_with_reverse_mode(x64):
@@ -352,7 +412,7 @@ def test_a_given_capacity_is_counted_and_drops_the_farthest_and_none_drops_nothi
 def lists_of(gaussians, camera, config=DEFAULT):
     projected = project_splats(as_splats(gaussians), camera, config)
     blending = blend_config(camera, config, len(gaussians), surface=False)
-    boxes = front_to_back(projected, blending)
+    boxes = bin_splats(projected, blending)
     return projected, blending, boxes, projected.shapes[boxes.order]
 
 
@@ -383,7 +443,7 @@ def test_depth_order_is_the_stable_argsort(count, near):
     visible = rng.random(count) < 0.8
     projected = eqx.tree_at(lambda p: (p.depths, p.visible), projected, (jnp.asarray(depths), jnp.asarray(visible)))
     truth = np.argsort(np.where(visible, depths, np.inf), kind="stable")
-    np.testing.assert_array_equal(front_to_back(projected, blending).order, truth)
+    np.testing.assert_array_equal(bin_splats(projected, blending).order, truth)
 
 
 def test_a_pass_lists_the_splats_that_reach_each_open_tile_front_to_back_and_no_others():
@@ -549,7 +609,7 @@ def test_a_chunks_running_products_and_sums_are_the_same_as_matrix_products(x64)
     rng = np.random.default_rng(4)
     alpha = rng.uniform(0, 0.99, (64, 9)) * rng.integers(0, 2, (64, 9))
     alpha[:, 0], alpha[:, 1] = 0.0, 0.99
-    through, gain = rng.uniform(0.2, 1, 9), rng.normal(size=(64, 9))
+    alpha, through, gain = (jnp.asarray(v) for v in (alpha, rng.uniform(0.2, 1, 9), rng.normal(size=(64, 9))))
     _, camera = make_scene(count=1)
     usual = blend_config(camera, RenderConfig(), 1, surface=False)
     by_scan, by_products = (replace(usual, by_products=products) for products in (False, True))

@@ -20,9 +20,10 @@ from pigjax.cli import app
 from pigjax.core.camera import look_at, stack_cameras
 from pigjax.core.errors import InputError, MissingFileError, SceneError
 from pigjax.scene import load_scene, run_scene, scene_from
-from pigjax.segmentation import lift_masks
+from pigjax.segmentation import Labels, lift_masks
 from pigjax.splat import RenderConfig, render
 from pigjax.study import Voting, experiment, load_study, sweep_study, tune_study
+from pigjax.study.experiment import _of_some
 from pigjax.study.objectives import pyramid_error, video
 from pigjax.study.optimize import load_table
 
@@ -387,3 +388,11 @@ def test_next_to_no_soft_votes_make_next_to_no_object():
     vote = voters(jnp.asarray(0.002))
     loss = jax.jit(lambda tau: vote.with_parameters({"segmentation.tau_d": tau}).scores()["loss"])
     assert float(loss(1e-6)) > float(loss(0.03)) + 0.2  # a start from which descent can tell where to go
+
+
+def test_only_keeps_labels_that_name_their_columns():
+    labels = Labels(jnp.array([5, 9, 5]), jnp.ones((3, 2)), jnp.ones(3), ids=jnp.array([5, 9]))
+    some = _of_some(labels, np.array([True, False, True]))
+    np.testing.assert_array_equal(some.object_id, [5, 5])
+    np.testing.assert_array_equal(some.ids, [5, 9])
+    assert some.votes.shape == (2, 2)

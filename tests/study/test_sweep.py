@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.sharding import Mesh
 
-from pigjax.core.errors import InputError, SimulationError
+from pigjax.core.errors import InputError, SimulationError, StaleError
 from pigjax.study.optimize import load_table, sweep
 from pigjax.study.optimize import sweep as sweep_function
 from pigjax.study.optimize.table import Table
@@ -228,6 +228,22 @@ def test_pivot_and_heat_map_show_each_row_in_its_place(tmp_path):
     two = Table({"a": np.ones(2), "b": np.ones(2)}, {"loss": np.ones(2)}, np.ones(2, bool), ("", ""))
     with pytest.raises(InputError, match="share a and b"):
         two.pivot("a", "b", "loss")
+
+
+def test_what_the_first_process_refuses_every_process_refuses(tmp_path, monkeypatch):
+    """Two processes, one after the other: the second hears only what the first one said before it ended."""
+    sweep(lambda p: p["a"], {"a": [1.0, 2.0]}, resume=tmp_path)
+    said, refusals = [], []
+    for process in range(2):
+        heard = iter(list(said))
+        monkeypatch.setattr(jax, "process_count", lambda: 2)
+        monkeypatch.setattr(jax, "process_index", lambda process=process: process)
+        tell = (lambda value: said.append(value) or value) if process == 0 else (lambda _, heard=heard: next(heard))
+        monkeypatch.setattr("jax.experimental.multihost_utils.broadcast_one_to_all", tell)
+        with pytest.raises(StaleError, match="parameters changed since") as refused:
+            sweep(lambda p: p["a"], {"a": [1.0, 3.0]}, resume=tmp_path)
+        refusals.append(str(refused.value))
+    assert refusals[0] == refusals[1]
 
 
 def test_two_processes_on_the_loopback_give_the_table_of_one(tmp_path):

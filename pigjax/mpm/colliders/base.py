@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from pigjax.core.arrays import as_array, as_float, static_field
+from pigjax.core.arrays import as_real, static_field
 from pigjax.core.checks import ANY, is_numeric, shown
 from pigjax.core.errors import InputError
 from pigjax.core.linalg import quat_multiply, quat_to_matrix, safe_norm, safe_normalize
@@ -28,12 +28,7 @@ Time = Float[Array, ""] | float
 
 def number(**kwargs: Any) -> Any:
     """Dynamic field of real numbers; integers become real."""
-    return eqx.field(converter=_as_real, **kwargs)
-
-
-def _as_real(value):
-    value = jnp.asarray(as_float(value)) if isinstance(value, int) and not isinstance(value, bool) else as_array(value)
-    return value.astype(float) if isinstance(value, Array) and jnp.issubdtype(value.dtype, jnp.integer) else value
+    return eqx.field(converter=as_real, **kwargs)
 
 
 class Contact(NamedTuple):
@@ -77,8 +72,8 @@ class Collider(eqx.Module):
     mode: str = static_field(default="separate", kw_only=True)
 
     def __check_init__(self):
-        if self.mode not in MODES:
-            raise InputError(f"mode = {self.mode!r}: choose one of {', '.join(MODES)}.")
+        if not isinstance(self.mode, str) or self.mode not in MODES:
+            raise InputError(f"mode = {shown(self.mode)}: choose one of {', '.join(MODES)}.")
         for field in dataclasses.fields(self):
             self.require(field.name, "its numbers must be finite", np.isfinite)
             self.require(field.name, "its numbers must be at most 1e15", lambda v: np.abs(v) <= ANY.high)

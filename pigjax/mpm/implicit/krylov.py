@@ -1,9 +1,9 @@
 """Preconditioned Krylov solves on the nodes of the grid.
 
-The preconditioner has two levels: a diagonal, and the ways in which each body moves and stretches as a whole, solved
-for exactly (deflation as an additive coarse space; Nabben and Vuik 2006, doi 10.1137/050626831). A stiff body in a long
-step is all stiffness to the diagonal, and its motion as a whole is a million times softer: without the second level the
-solver would neither find it nor see that it is missing.
+The preconditioner has two levels: a diagonal, and a coarse space of the affine motions of each body, solved for exactly
+(deflation as an additive coarse space; Nabben and Vuik 2006, doi 10.1137/050626831). In a long step the diagonal of a
+stiff body is all stiffness, and its motion as a whole is a million times softer: without the coarse space the solver
+would neither find that motion nor see that it is missing.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pigjax.core.arrays import einsum, everywhere, matmul
 
 Nodes = Float[Array, "x y z 3"]
 Modes = Float[Array, "k x y z"]  # fields, each of them along x, y and z
-_SOFTEST = 1e-6  # ratio of the eigenvalues of the second level that counts: float32 knows no smaller one
+_SOFTEST = 1e-6  # least ratio of the coarse space's eigenvalues: float32 resolves no smaller one
 
 
 class Preconditioner(NamedTuple):
@@ -31,13 +31,13 @@ class Preconditioner(NamedTuple):
     inverse: Float[Array, "n n"]  # of the operator in the space of the modes [1/kg]
 
     def __call__(self, momentum: Nodes) -> Nodes:
-        """Velocities [m/s] that about give this momentum [kg m/s]."""
+        """Velocities [m/s] that approximately have this momentum [kg m/s]."""
         amounts = matmul(self.inverse, _moments(self.modes, momentum))
         whole = einsum("kxyz,ki->xyzi", self.modes, amounts.reshape(-1, 3))
         return self.diagonal(momentum) + whole
 
     def size(self, momentum: Nodes) -> Float[Array, ""]:
-        """Root of the momentum times the velocities that it brings [√J]."""
+        """Norm of a momentum: the root of its product with the velocities that have it [√J]."""
         return jnp.sqrt((momentum * self(momentum)).sum())
 
 
@@ -53,9 +53,13 @@ def in_modes(apply: Callable[[Nodes], Nodes], modes: Modes) -> Float[Array, "n n
 
 
 def precondition(diagonal: Callable[[Nodes], Nodes], modes: Modes, matrix: Float[Array, "n n"]) -> Preconditioner:
-    """The preconditioner of an operator that `diagonal` about solves node by node, and that is `matrix` in the modes.
+    """Preconditioner of an operator.
 
-    Directions that buckle count with their stiffness, not its sign.
+    Args:
+        diagonal: solves it approximately, node by node.
+        modes: the coarse space.
+        matrix: the operator in the coarse space. Directions that buckle count with the absolute value of their
+            stiffness.
     """
     size = jnp.sqrt(jnp.abs(jnp.diagonal(matrix)))
     weight = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1.0), 0.0)
@@ -69,9 +73,10 @@ def precondition(diagonal: Callable[[Nodes], Nodes], modes: Modes, matrix: Float
 def conjugate_gradients(
     apply: Callable[[Nodes], Nodes], right: Nodes, precondition: Preconditioner, *, tolerance: float, steps: int
 ) -> Nodes:
-    """Solution of a symmetric system to a tolerance relative to the right side, both by the preconditioner's measure.
+    """Solution of a symmetric system by preconditioned conjugate gradients.
 
-    It ends early where the operator is not positive: in a direction that buckles.
+    The tolerance is relative to the right-hand side, both in the preconditioner's norm. It ends early in a direction
+    that buckles, where the operator is not positive.
     """
     start = precondition(right)
     first = (right * start).sum()
@@ -95,7 +100,7 @@ def conjugate_gradients(
     none = jnp.zeros((), int)
     carry = lax.while_loop(unfinished, improve, (none, jnp.zeros_like(right), right, start, first, jnp.asarray(True)))
     step, x, positive = carry[0], carry[1], carry[5]
-    return jnp.where(~positive & (step == 1), start, x)  # downhill at least
+    return jnp.where(~positive & (step == 1), start, x)  # a descent direction at least
 
 
 def stabilized_gradients(
@@ -106,9 +111,9 @@ def stabilized_gradients(
     tolerance: float,
     steps: int,
 ) -> Nodes:
-    """Solution of a system that need not be symmetric (BiCGSTAB), to a tolerance relative to the right side's."""
+    """Solution of a system that need not be symmetric (BiCGSTAB), to a tolerance relative to the right-hand side."""
     return bicgstab(lambda d: precondition(apply(d)), precondition(right), tol=tolerance, maxiter=steps)[0]
 
 
-def _moments(modes, momentum):
+def _moments(modes: Modes, momentum: Nodes) -> Float[Array, "n"]:
     return einsum("kxyz,xyzi->ki", modes, momentum).reshape(-1)

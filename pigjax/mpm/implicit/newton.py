@@ -1,10 +1,10 @@
-"""Backward Euler on the grid: the velocities that the stresses at the end of the step balance, by Newton's method.
+"""Backward Euler on the grid: node velocities in balance with the stresses at the end of the step, by Newton's method.
 
 Each Newton step is a Krylov solve with the derivatives of the forces (Gast et al. 2015, doi 10.1109/TVCG.2015.2459687).
-What is in the way of matter holds it softly, as stiff as the matter is itself: that is a convex problem, where hard
-contact would make Newton's method jump between sets of touched nodes. What presses is then known, and friction is found
-with it in a second solve (lagged, as by Li et al. 2020, doi 10.1145/3386569.3392425), so that stiff matter shares its
-impulse within the step. Derivatives go by the implicit function theorem.
+Colliders are compliant (penalty) constraints, as stiff as the matter: the problem is convex, where hard contact would
+make Newton's method jump between sets of touched nodes. The first solve has no friction and gives the normal pressure;
+a second one adds friction of that pressure (lagged, as by Li et al. 2020, doi 10.1145/3386569.3392425), so that stiff
+matter shares its impulse within the step. Derivatives follow the implicit function theorem.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from pigjax.core.arrays import everywhere
-from pigjax.mpm.colliders import Press
+from pigjax.mpm.colliders import Collider, Press, Time
 from pigjax.mpm.implicit.krylov import (
     Modes,
     Nodes,
@@ -32,56 +32,56 @@ from pigjax.mpm.implicit.krylov import (
 )
 from pigjax.mpm.implicit.stiffness import forces, masses, stiffness, tangents
 from pigjax.mpm.materials import LAWS
-from pigjax.mpm.substep import Scene, Setting, boundaries, free_velocity
+from pigjax.mpm.substep import StepContext, StepStatics, apply_boundaries, free_velocity
 
-_CONTACT = 1.0  # stiffness of what is in the way, relative to the diagonal of the matter's
-_INERTIA = 100.0  # what is in the way holds light matter as if it weighed so many times what it does
-_LENGTHS = 6  # of a Newton step that are tried
+_CONTACT = 1.0  # stiffness of the penalty, relative to the diagonal of the matter's
+_INERTIA = 100.0  # inertia of the penalty, relative to the mass of the node, which holds light matter
+_LENGTHS = 6  # step lengths that a line search tries
 _PATIENCE = 4  # Newton steps without gain
 _FORCING = 0.05  # residual of the Krylov solve of a Newton step, relative to its right-hand side
-_ROUNDING = 1 / 16  # share of the worst case by which rounding keeps float32 from the balance, as met up to E = 1e11
-_EXACT = 1e-8  # the same where derivatives are wanted
+_ROUNDING = 1 / 16  # residual by rounding, as a share of its worst case; measured in float32 up to E = 1e11
+_EXACT = 1e-8  # residual of the Krylov solve of a derivative, relative to its right-hand side
 
-Limit = Callable[[Nodes], Nodes]  # velocities that what is in the way leaves of others
+Limit = Callable[[Nodes], Nodes]  # velocities after colliders and walls
 
 
 def balanced_velocity(
-    setting: Setting, scene: Scene, states: tuple[Any, ...], nodes: Float[Array, "x y z 4"], time: Array
+    statics: StepStatics, context: StepContext, states: tuple[Any, ...], nodes: Float[Array, "x y z 4"], time: Time
 ) -> tuple[Nodes, Bool[Array, ""]]:
-    """Velocities of the nodes at the end of the step, and whether Newton's method has reached its tolerance.
+    """Velocities of the nodes [m/s] at the end of the step, and whether Newton's method has reached its tolerance.
 
     Args:
-        setting: what is compiled in.
-        scene: what all steps share.
+        statics: the choices that are compiled in.
+        context: the arrays that all steps share.
         states: particles of each law, in chunks.
         nodes: mass [kg] and momentum [kg m/s] without stress.
         time: of the step's beginning [s].
     """
-    filled, guess = free_velocity(scene, nodes)
-    mass, stiff = jnp.where(filled, nodes[..., :1], scene.unit_mass), stiffness(setting, scene, states)
-    step = _Step(setting, scene, states, filled, guess, mass, stiff)
+    filled, guess = free_velocity(context, nodes)
+    mass, stiff = jnp.where(filled, nodes[..., :1], context.unit_mass), stiffness(statics, context, states)
+    step = _Step(statics, context, states, filled, guess, mass, stiff)
     modes = lax.stop_gradient(_modes(step))
     coarse = lax.stop_gradient(in_modes(_unhindered(step, guess), modes))
-    smooth = scene._replace(colliders=tuple(map(_without_friction, scene.colliders)))
-    limit = partial(boundaries, setting, smooth, time=time)
+    smooth = context._replace(colliders=tuple(map(_without_friction, context.colliders)))
+    limit = partial(apply_boundaries, statics, smooth, time=time)
     v, found = _balance(step, modes, coarse, limit, guess, limit)
-    if any(collider.mode == "separate" for collider in scene.colliders):
-        limit = partial(boundaries, setting, scene, time=time)
+    if any(collider.mode == "separate" for collider in context.colliders):
+        limit = partial(apply_boundaries, statics, context, time=time)
         speeds = _pressing(smooth, v, time)
         exact, secant = (partial(limit, press=[Press(s, secant=k) for s in speeds]) for k in (False, True))
         v, found_too = _balance(step, modes, coarse, exact, v, secant)
         found &= found_too
-    return boundaries(setting, scene, v, time=time), found
+    return apply_boundaries(statics, context, v, time=time), found
 
 
 class _Step(NamedTuple):
-    """What does not change while the velocities of a step are looked for."""
+    """The constants of the solve of one step."""
 
-    setting: Setting
-    scene: Scene
+    statics: StepStatics
+    context: StepContext
     states: tuple[Any, ...]
     filled: Bool[Array, "x y z 1"]  # nodes with mass
-    guess: Nodes  # velocities without stress and with nothing in the way
+    guess: Nodes  # velocities without stress and contact
     mass: Float[Array, "x y z 1"]
     stiff: Float[Array, "x y z 1"]  # diagonal of dt² times the stiffness [kg]
 
@@ -92,26 +92,27 @@ class _Step(NamedTuple):
 
     @property
     def hold(self) -> Float[Array, "x y z 1"]:
-        """The same of what is in the way."""
+        """Diagonal of the penalty's operator [kg]."""
         return _INERTIA * self.mass + _CONTACT * self.stiff
 
 
 def _balance(
     step: _Step, modes: Modes, coarse: Float[Array, "n n"], limit: Limit, start: Nodes, secant: Limit
 ) -> tuple[Nodes, Bool[Array, ""]]:
-    """Velocities that balance where what is in the way pushes by how much `limit` changes them; were they found?
+    """Velocities in balance with stresses and with penalty forces, and whether they were found.
 
-    Newton's method takes the derivative of `secant`, which must not be less.
+    The penalty is proportional to the change of velocity by `limit`. Newton's method takes the derivative of `secant`
+    instead, which must not be less.
     """
 
     def residual(v):
         """Momentum [kg m/s] by which v misses its balance."""
-        stress = step.scene.dt * jnp.where(step.filled, forces(step.setting, step.scene, step.states, v), 0)
+        stress = step.context.dt * jnp.where(step.filled, forces(step.statics, step.context, step.states, v), 0)
         return step.mass * (v - step.guess) - stress + step.hold * (v - limit(v))
 
     def tangent_solve(apply, right):
         about = precondition(lambda r: r / step.scale, modes, coarse)
-        exact = partial(stabilized_gradients, precondition=about, tolerance=_EXACT, steps=step.setting.krylov_steps)
+        exact = partial(stabilized_gradients, precondition=about, tolerance=_EXACT, steps=step.statics.krylov_steps)
         return lax.custom_linear_solve(apply, right, exact, transpose_solve=exact)
 
     newton = partial(_newton, step, modes, coarse, secant)
@@ -125,23 +126,25 @@ class _Best(NamedTuple):
     balanced: Bool[Array, ""]  # whether it is within the tolerance
 
 
-def _newton(step, modes, coarse, limit, residual, start):
-    """The velocities nearest to balance that were met, and 1 if they are within the tolerance."""
-    setting, scene = step.setting, step.scene
-    rounding = _ROUNDING * jnp.finfo(start.dtype).eps * scene.grid.dx / scene.dt * step.stiff
+def _newton(
+    step: _Step, modes: Modes, coarse: Float[Array, "n n"], limit: Limit, residual: Limit, start: Nodes
+) -> tuple[Nodes, Float[Array, ""]]:
+    """The velocities with the least residual of all iterations, and 1 if it is within the tolerance, else 0."""
+    statics, context = step.statics, step.context
+    rounding = _ROUNDING * jnp.finfo(start.dtype).eps * context.grid.dx / context.dt * step.stiff
     noise = jnp.sqrt((rounding**2 / step.scale).sum())
 
     def unfinished(carry):
         count, _, _, best, last = carry
-        return ~everywhere(best.balanced | (count >= setting.newton_steps) | (count - last > _PATIENCE))
+        return ~everywhere(best.balanced | (count >= statics.newton_steps) | (count - last > _PATIENCE))
 
     def improve(carry):
         count, v, r, best, last = carry
         d, about = _direction(step, modes, coarse, limit, v, r)
         v, r = _line_search(residual, v, r, d)
-        # against the impulses that balance here: by the preconditioner, which knows how soft the whole is
-        drive = about.size(step.mass * (v - step.guess)) + about.size(scene.dt * step.mass * scene.gravity)
-        found = _Best(v, r, about.size(r) <= setting.newton_tolerance * drive + noise)
+        # relative to the impulses that drive the step, in the preconditioner's norm, which knows how soft the whole is
+        drive = about.size(step.mass * (v - step.guess)) + about.size(context.dt * step.mass * context.gravity)
+        found = _Best(v, r, about.size(r) <= statics.newton_tolerance * drive + noise)
         better = about.size(r) < about.size(best.r)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), found, best)
         return count + 1, v, r, best, jnp.where(better, count + 1, last)
@@ -152,14 +155,16 @@ def _newton(step, modes, coarse, limit, residual, start):
     return best.v, best.balanced.astype(start.dtype)  # a float: custom_root wants a tangent of it
 
 
-def _unhindered(step, v):
-    """What momentum [kg m/s] a change of velocities takes, around v and with nothing in the way."""
-    change_of_force = tangents(step.setting, step.scene, step.states, v)
-    return lambda d: step.mass * d - step.scene.dt * jnp.where(step.filled, change_of_force(d), 0)
+def _unhindered(step: _Step, v: Nodes) -> Limit:
+    """The operator from a change of velocities around v to momentum [kg m/s], without contact."""
+    change_of_force = tangents(step.statics, step.context, step.states, v)
+    return lambda d: step.mass * d - step.context.dt * jnp.where(step.filled, change_of_force(d), 0)
 
 
-def _direction(step, modes, coarse, limit, v, r) -> tuple[Nodes, Preconditioner]:
-    """Newton's, and the preconditioner that found it."""
+def _direction(
+    step: _Step, modes: Modes, coarse: Float[Array, "n n"], limit: Limit, v: Nodes, r: Nodes
+) -> tuple[Nodes, Preconditioner]:
+    """Newton's direction, and the preconditioner that found it."""
     alone = _unhindered(step, v)
     _, free = jax.linearize(limit, v)
 
@@ -170,15 +175,15 @@ def _direction(step, modes, coarse, limit, v, r) -> tuple[Nodes, Preconditioner]
         inside = free(r)
         return inside / step.scale + (r - inside) / (step.scale + step.hold)
 
-    symmetric = all(LAWS[law].total for law in step.setting.laws)
+    symmetric = all(LAWS[law].total for law in step.statics.laws)
     solve = conjugate_gradients if symmetric else stabilized_gradients
     about = precondition(diagonal, modes, coarse + in_modes(held, modes))
-    steps = step.setting.krylov_steps
+    steps = step.statics.krylov_steps
     return solve(lambda d: alone(d) + held(d), -r, precondition=about, tolerance=_FORCING, steps=steps), about
 
 
-def _line_search(residual, start, r, direction):
-    """Velocities along the direction where the imbalance along it is at most half of what it was, and the residual."""
+def _line_search(residual: Limit, start: Nodes, r: Nodes, direction: Nodes) -> tuple[Nodes, Nodes]:
+    """Velocities along the direction where the residual along it is at most half of its first value; the residual."""
     slope = (r * direction).sum()
 
     def too_far(carry):
@@ -186,7 +191,7 @@ def _line_search(residual, start, r, direction):
         return ~everywhere((jnp.abs(after) <= 0.5 * jnp.abs(slope)) | (count >= _LENGTHS))
 
     def between(carry):
-        """By the secant, between a length that is too short and one that is too long."""
+        """A length by the secant between one that is too short and one that is too long."""
         count, low, high, length, _, after = carry
         short = after * slope > 0
         low, high = (
@@ -205,23 +210,23 @@ def _line_search(residual, start, r, direction):
     return start + length * direction, r
 
 
-def _modes(step) -> Modes:
-    """Ways in which each material moves as a whole: its share of the nodes, and that times their place."""
-    share = jnp.moveaxis(masses(step.setting, step.scene, step.states), -1, 0)
+def _modes(step: _Step) -> Modes:
+    """Affine motions of each material as a whole: its share of the nodes, and that times their place."""
+    share = jnp.moveaxis(masses(step.statics, step.context, step.states), -1, 0)
     mass, filled = share.sum(0), step.filled[..., 0]
     share = jnp.where(filled, share / jnp.where(filled, mass, 1.0), 0.0)
-    axes = [jnp.arange(n, dtype=share.dtype) for n in step.scene.grid.shape]
+    axes = [jnp.arange(n, dtype=share.dtype) for n in step.context.grid.shape]
     nodes = jnp.stack(jnp.meshgrid(*axes, indexing="ij"))
-    ways = []
+    modes = []
     for own in share:
         weight = own * mass / jnp.maximum((own * mass).sum(), jnp.finfo(mass.dtype).tiny)
         from_middle = nodes - (weight * nodes).sum((1, 2, 3), keepdims=True)
         spread = jnp.sqrt((weight * from_middle**2).sum((1, 2, 3), keepdims=True))
-        ways += [own[None], own * from_middle / jnp.where(spread > 0, spread, 1.0)]
-    return jnp.concatenate(ways)
+        modes += [own[None], own * from_middle / jnp.where(spread > 0, spread, 1.0)]
+    return jnp.concatenate(modes)
 
 
-def _pressing(smooth, v, time):
+def _pressing(smooth: StepContext, v: Nodes, time: Time) -> list[Float[Array, "x y z 1"]]:
     """Speeds [m/s] at which nodes press against each collider, one after another."""
     found = []
     for collider, contact in zip(smooth.colliders, smooth.contacts):
@@ -232,5 +237,5 @@ def _pressing(smooth, v, time):
     return found
 
 
-def _without_friction(collider):
+def _without_friction(collider: Collider) -> Collider:
     return eqx.tree_at(lambda c: c.friction, collider, jnp.zeros_like(collider.friction))

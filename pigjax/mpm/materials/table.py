@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import fields
 
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import as_array, as_float, static_field
+from pigjax.core.arrays import as_real, static_field
 from pigjax.core.checks import Limits, is_numeric, shown
 from pigjax.core.errors import InputError
 from pigjax.mpm.materials.laws import law_of
@@ -20,12 +21,7 @@ from pigjax.mpm.materials.laws import law_of
 
 def _number(**kwargs):
     """A number that a user may sweep: always an array, so that a new value never recompiles."""
-    return eqx.field(converter=_as_number, kw_only=True, **kwargs)
-
-
-def _as_number(value):
-    real = isinstance(value, int | float) and not isinstance(value, bool)
-    return jnp.asarray(as_float(value)) if real else as_array(value)
+    return eqx.field(converter=as_real, kw_only=True, **kwargs)
 
 
 class Parameters(eqx.Module):
@@ -183,9 +179,15 @@ def material_table(materials: Sequence[Material]) -> MaterialTable:
     """Table with one row for each material, in their order.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none, or a number of one is an array.
     """
     if not materials:
         raise InputError("material_table needs at least one material.")
+    for number, material in itertools.product(fields(Parameters), materials):
+        if np.ndim(value := getattr(material, number.name)):
+            raise InputError(
+                f"{number.name} = {shown(value)}: a row of a material table has one number; give a material for each"
+                " row, or jax.vmap over them."
+            )
     columns = {f.name: jnp.stack([getattr(m, f.name) for m in materials]) for f in fields(Parameters)}
     return MaterialTable(laws=tuple(m.model for m in materials), **columns)

@@ -1,4 +1,4 @@
-"""Bounds of parameters, kept by a smooth change of variables: what is optimised is free, what is used never leaves."""
+"""Bounds of parameters, kept by a smooth change of variables: optimised numbers are free, used ones in bounds."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ _EDGE = 1e-6  # share of the range, or absolute where there is one end, that a s
 
 @dataclass(frozen=True)
 class Bounds:
-    """Where a parameter may go: ends for all of its components or one for each, None where there is none.
+    """Range of a parameter: ends for all of its components or one for each, None where there is none.
 
     Two ends are kept by a sigmoid, one by a softplus. With scale = "log" steps multiply instead of adding, which suits
-    what spans decades, as Young's modulus does; it then must be > 0.
+    parameters that span decades, as Young's modulus does; they then must be > 0.
 
     Raises:
         InputError: the lower end is not below the upper one, or an end of a logarithmic scale is not > 0.
     """
 
-    low: End = None
-    high: End = None
-    scale: Literal["linear", "log"] = "linear"
+    low: End = None  # in the unit of the parameter
+    high: End = None  # in the unit of the parameter
+    scale: Literal["linear", "log"] = "linear"  # of the steps
 
     def __post_init__(self):
-        if self.scale not in ("linear", "log"):
-            raise InputError(f"Bounds.scale = {self.scale!r}: choose linear or log.")
+        if not isinstance(self.scale, str) or self.scale not in ("linear", "log"):
+            raise InputError(f"Bounds.scale = {shown(self.scale)}: choose linear or log.")
         for name, end in (("low", self.low), ("high", self.high)):
             if end is not None and not _is_numbers(end):
                 raise InputError(f"Bounds.{name} = {shown(end)}: must be a number, one for each component, or None.")
@@ -121,7 +121,7 @@ class Bounds:
 def _is_numbers(end: Any) -> bool:
     try:
         array = np.asarray(end)
-    except ValueError:  # a list of lists that differ in length
+    except (TypeError, ValueError):  # a list of lists that differ in length, a random key
         return False
     return array.size > 0 and np.issubdtype(array.dtype, np.number)
 

@@ -55,7 +55,7 @@ def fit(
 ) -> tuple[Any, History]:
     """Make a loss small by gradients. Host.
 
-    A step whose loss or gradient is not finite is rejected: the search goes on from the best parameters with half the
+    A step whose loss or gradient is not finite is rejected: the search continues from the best parameters with half the
     rate. Where the loss has not improved for `patience` steps it starts again from the best, with a fresh optimiser
     and half the rate, as often as `restarts` says, and then stops.
 
@@ -66,14 +66,14 @@ def fit(
         optimizer: of optax, or the rate of Adam. It works on the unconstrained numbers behind the bounds.
         steps: most steps.
         bounds: `Bounds`, pairs (low, high) or None for the leaves of `params`, in a pytree like it or above it.
-        callback: told each step; True stops the search.
+        callback: called with each step; True stops the search.
         clip: largest norm of a gradient.
         patience: steps without a loss better by `tolerance` (relative) before a restart or the end; None: never.
         tolerance: relative.
         restarts: from the best, after a plateau.
-        shared: arrays that the loss needs, a pytree; what it closes over instead is compiled into the program.
+        shared: arrays that the loss needs, a pytree; closed-over arrays are compiled into the program instead.
         has_aux: see `loss`.
-        checkpoint: file that a killed search goes on from, bit for bit; it does not keep the scores of `has_aux`.
+        checkpoint: file from which a killed search resumes, bit for bit; it does not keep the scores of `has_aux`.
         every: steps between checkpoints.
         mark: what the loss depends on beside its code, what it closes over and `shared`, as a mapping by name or any
             value: files that it reads, for example.
@@ -186,7 +186,7 @@ def _next(state, value, good, moved, optimiser, descent, patience, tolerance, re
 
 
 def parts_of_search(mark: Any, **named: Any) -> dict[str, str]:
-    """Parts of the provenance of a search: the caller's mark, and what the search itself depends on."""
+    """Parts of the provenance of a search: the caller's mark, and the inputs of the search itself."""
     parts = io.parts_of({"": mark if isinstance(mark, Mapping) else {"mark": mark}})
     return parts | io.parts_of({**named, "precision": str(jnp.result_type(float))})
 
@@ -201,7 +201,7 @@ def _broken(names, used, value, norm):
 
 
 def flat_parameters(params: Any, bounds: Any) -> tuple[list[str], list[jax.Array], list[Bounds], Callable[[list], Any]]:
-    """Names, leaves and bounds of the parameters, and what makes them whole again.
+    """Names, leaves and bounds of the parameters, and the inverse of the flattening.
 
     Raises:
         InputError: a parameter is not real, or starts on or beyond its bounds.

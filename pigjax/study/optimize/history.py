@@ -1,4 +1,4 @@
-"""What a search met on its way."""
+"""History of a search: losses and parameters, step by step."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from pigjax import io
 
 
 class Step(NamedTuple):
-    """One step, as a callback is told it."""
+    """One step, as a callback gets it."""
 
     step: int  # from 1
     loss: float
     gradient: float  # norm; NaN without gradients
     parameters: dict[str, np.ndarray]
     good: bool  # finite
-    scores: dict[str, float]  # what the loss gave beside it
+    scores: dict[str, float]  # auxiliary outputs of the loss
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class History:
     gradient: Float[np.ndarray, "s"]  # norm; NaN without gradients
     good: Bool[np.ndarray, "s"]  # whether loss and gradient were finite
     parameters: dict[str, Shaped[np.ndarray, "s ..."]]
-    scores: dict[str, Float[np.ndarray, "s"]]  # what the loss gave beside it
+    scores: dict[str, Float[np.ndarray, "s"]]  # auxiliary outputs of the loss
     seconds: Float[np.ndarray, "s"]  # since the search, or its present part, began
     stop: str  # "steps", "plateau" or "callback"
 
@@ -105,11 +105,11 @@ class Recorder:
         return Step(number + 1, float(loss), float(norm), parameters, good, told)
 
     def arrays(self) -> Any:
-        """What a checkpoint keeps; what the loss gave beside it is not."""
+        """Arrays for a checkpoint, without the auxiliary outputs of the loss."""
         return self.numbers, self.good, self.values
 
     def restore(self, arrays: Any, count: int) -> None:
-        """Take back what a checkpoint kept."""
+        """Restore the arrays of a checkpoint."""
         self.numbers, self.good, self.values = (
             np.array(arrays[0]), np.array(arrays[1]), [np.array(value) for value in arrays[2]]
         )  # fmt: skip

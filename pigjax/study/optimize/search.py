@@ -54,9 +54,9 @@ def search(
         vectorize: False calls the loss candidate by candidate outside of jit; what it raises for bad input or a broken
             simulation counts as not finite.
         seed: of the candidates.
-        checkpoint: file that a killed search goes on from, bit for bit: it holds the losses, by which the generations
+        checkpoint: file from which a killed search resumes, bit for bit: it holds the losses, by which the generations
             so far are drawn again.
-        callback: told the best candidate of each generation; True stops the search.
+        callback: called with the best candidate of each generation; True stops the search.
         mark: as in `fit`.
         overwrite: as in `fit`.
 

@@ -57,12 +57,12 @@ def sweep(
             list of sets of parameters, pytrees of one structure.
         mesh: of one axis, over which a batch is shared out; all devices of all processes by default.
         batch: rows at once; by default 32 for each device, or fewer if memory is short.
-        resume: folder where finished batches are kept, so that a killed sweep goes on.
-        shared: what all rows share, a pytree of arrays. What `fn` closes over instead is compiled into the program.
+        resume: folder where finished batches are kept, so that a killed sweep resumes.
+        shared: inputs of all rows, a pytree of arrays. Arrays that `fn` closes over are compiled into the program.
         check: raises InputError for parameters that cannot be (host).
         vectorize: False calls `fn` row after row outside of jit, for functions that no one can trace; what they raise
             for bad input or a broken simulation marks the row.
-        callback: told rows done and rows to do after each batch.
+        callback: called with rows done and rows to do after each batch.
         mark: what the results depend on beside `fn` (its code and what it closes over), the parameters and `shared`,
             as a mapping by name or any value: files that `fn` reads, for example.
         overwrite: replace rows in `resume` that were made from something else, instead of refusing them.
@@ -76,13 +76,12 @@ def sweep(
     call: Function = fn if shared is None else partial(_with_shared, fn, shared)
     errors = [_refusal(check, row) for row in rows]
     todo = [index for index, error in enumerate(errors) if error is None]
-    keep = _Keep(resume)
+    keep, results = _Keep(resume), dict[int, dict[str, np.ndarray]]()
     if resume is not None:
         parts = io.parts_of({"": mark if isinstance(mark, Mapping) else {"mark": mark}})
         parts |= io.parts_of({"fn": fn, "parameters": io.digest(stacked), "shared": io.digest(shared)})
         parts["precision"] = str(jnp.result_type(float))
-        keep.claim(parts, overwrite)
-    results = dict(keep.read(len(rows)))
+        results |= _by_first(lambda: keep.claim(parts, overwrite).read(len(rows)))
     if callback is not None and results:
         callback(len(results), len(todo))
     remaining = [index for index in todo if index not in results]
@@ -142,31 +141,30 @@ def _refusal(check: Callable[[Any], None] | None, row: Any) -> str | None:
 
 
 class _Keep:
-    """Finished rows in a folder; of several processes the first one writes, and tells the others."""
+    """Finished rows in a folder, which of several processes only the first one reads and writes."""
 
     def __init__(self, folder: str | os.PathLike[str] | None):
         self.folder, self.signature = folder, ""
 
-    def claim(self, parts: dict[str, str], overwrite: bool) -> None:
+    def claim(self, parts: dict[str, str], overwrite: bool) -> _Keep:
+        """Refuse rows made from something else."""
         assert self.folder is not None
-        if jax.process_index() == 0:
-            self.signature = io.claim(self.folder, parts, results=(io.STATES,), overwrite=overwrite, signed=io.signed)
+        self.signature = io.claim(self.folder, parts, results=(io.STATES,), overwrite=overwrite, signed=io.signed)
+        return self
 
     def read(self, count: int) -> dict[int, dict[str, np.ndarray]]:
         """Rows on disk; damaged files are left out with a warning, so that their rows are computed again."""
-        if self.folder is None:
-            return {}
+        assert self.folder is not None
         found: dict[int, dict[str, np.ndarray]] = {}
-        if jax.process_index() == 0:
-            for path in sorted(Path(self.folder).glob("*.npz")):
-                if not path.stem.isdecimal():
-                    continue
-                try:
-                    state = io.load_state(self.folder, int(path.stem), signature=self.signature)
-                    found |= _rows_of(path, state, count)
-                except InputError as error:
-                    io.set_aside(path, error)
-        return _told_by_first(found) if jax.process_count() > 1 else found
+        for path in sorted(Path(self.folder).glob("*.npz")):
+            if not path.stem.isdecimal():
+                continue
+            try:
+                state = io.load_state(self.folder, int(path.stem), signature=self.signature)
+                found |= _rows_of(path, state, count)
+            except InputError as error:
+                io.set_aside(path, error)
+        return found
 
     def write(self, done: dict[int, dict[str, np.ndarray]]) -> None:
         if self.folder is None or jax.process_index() != 0 or not done:
@@ -183,9 +181,25 @@ def _rows_of(path: Path, state: dict[str, np.ndarray], count: int) -> dict[int, 
     return {int(k): {name: np.asarray(own[at]) for name, own in state.items()} for at, k in enumerate(index)}
 
 
-def _told_by_first(found: dict[int, dict[str, np.ndarray]]) -> dict[int, dict[str, np.ndarray]]:
-    """The first process's finished rows, in every process."""
-    sent = np.frombuffer(pickle.dumps(found), np.uint8)
+def _by_first(work: Callable[[], Any]) -> Any:
+    """What `work` gives, or raises, in the first process: in every process, so that none waits for one that ended."""
+    if jax.process_count() == 1:
+        return work()
+    result, error = None, None
+    if jax.process_index() == 0:
+        try:
+            result = work()
+        except Exception as raised:
+            error = raised
+    result, told = _told_by_first((result, error))
+    if error is not None or told is not None:
+        raise error or told
+    return result
+
+
+def _told_by_first(value: Any) -> Any:
+    """The first process's value, in every process."""
+    sent = np.frombuffer(pickle.dumps(value), np.uint8)
     size = int(multihost_utils.broadcast_one_to_all(np.int32(len(sent))))
     room = np.zeros(size, np.uint8)
     if jax.process_index() == 0:
@@ -244,7 +258,7 @@ class _Program:
         self.compiled = jax.jit(mapped).lower(self._take([0]), self.shared).compile()
 
     def rows_that_fit(self) -> int:
-        """Rows that memory holds, by what the compiled program needs."""
+        """Rows that memory holds, by the memory of the compiled program."""
         need = self.compiled.memory_analysis()
         if need is None:
             return self.size

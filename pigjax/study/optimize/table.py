@@ -31,10 +31,10 @@ def columns_of(tree: Any, alone: str) -> dict[str, np.ndarray]:
 class Table:
     """Parameters and results, as columns [n ...]."""
 
-    parameters: Columns
-    results: Columns
+    parameters: Columns  # by the names of the parameters
+    results: Columns  # by the names of the results
     ok: Bool[np.ndarray, "n"]  # whether all results of the row are finite
-    errors: tuple[str, ...]  # what is wrong with a row, "" where nothing is
+    errors: tuple[str, ...]  # message of a row that failed, "" for the others
 
     def __len__(self) -> int:
         return len(self.ok)
@@ -179,6 +179,9 @@ class Table:
 @checked
 def load_table(path: PathLike) -> Table:
     """A table that `Table.save` wrote as `.npz`. Host.
+
+    Args:
+        path: the file (.npz).
 
     Raises:
         MissingFileError: there is no such file.
