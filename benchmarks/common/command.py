@@ -122,6 +122,7 @@ def _changed(parser: argparse.ArgumentParser, module: ModuleType, options: argpa
         destination = option.replace("-", "_")
         value = getattr(options, destination)
         if value != parser.get_default(destination):
-            texts = [] if value is True else value if isinstance(value, list) else [value]
-            said.append(" ".join([f" --{option}", *map(str, texts)]))
+            values = [] if value is True else value if isinstance(value, list) else [value]
+            texts = (f"{value:g}" if isinstance(value, float) else str(value) for value in values)
+            said.append(" ".join([f" --{option}", *texts]))
     return "".join(said)

@@ -103,3 +103,10 @@ def test_steps_give_all_states_and_a_window_each():
     found = frames_of(lambda x: x + 1, 0, 5)
     assert found.result == list(range(6))
     assert len(found.windows) == 5
+
+
+def test_no_benchmark_patches_the_library():
+    files = [
+        path for path in command.HERE.rglob("*.py") if "mock" in path.read_text() or "setattr(" in path.read_text()
+    ]
+    assert not files
