@@ -42,7 +42,7 @@ class ClampParams(eqx.Module):
     lambda_S: Float[Array, "*batch"] = real_field(default=0.8, limits=Limits(-1e3, 1e3))
     relative: bool = static_field(default=True)  # tau in units of each rest scale, else in metres
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_fields(self)
         known = is_known(self.tau_min, self.tau_max)
         if known and bool(jnp.any(self.tau_min > self.tau_max)):

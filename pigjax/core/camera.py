@@ -37,7 +37,7 @@ class Camera(eqx.Module):
     width: int = static_field(limits=Limits(1, 65536, unit="px"))  # of the image [px]
     height: int = static_field(limits=Limits(1, 65536, unit="px"))  # of the image [px]
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         arrays = (self.world_to_cam, self.focal, self.centre)
         if not all(axis is None or type(axis) is int for axis in arrays):  # else the axes that jax.vmap is told
             check_fields(self)

@@ -20,7 +20,7 @@ class Gaussians(eqx.Module):
     logit_opacities: Float[Array, "n"] = real_field()  # sigmoid gives the opacity in (0, 1)
     sh: Float[Array, "n k 3"] = real_field()  # spherical harmonics, k = (degree + 1)²
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_axes(self)
 
     def __len__(self) -> int:

@@ -38,7 +38,7 @@ class Particles(eqx.Module):
     body: Int[Array, "p"] = array_field()  # number of its body, for `BodyContact` and `Sleep`
     counts: tuple[int, ...] = static_field()  # particles of each row, which sizes the groups by law
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_axes(self)
 
     def __len__(self) -> int:

@@ -65,7 +65,7 @@ class FitConfig(eqx.Module):
     seed: int = static_field(default=0, limits=Limits(0, LARGEST_WHOLE - 2))
     render: RenderConfig = static_field(default=RenderConfig())
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_fields(self)
         if not isinstance(self.render, RenderConfig):
             raise InputError(f"FitConfig.render = {shown(self.render)}: must be a RenderConfig.")

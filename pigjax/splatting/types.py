@@ -43,7 +43,7 @@ class Splats(eqx.Module):
     # rotation of the matter since rest; view-dependent colour turns with it
     sh_rotations: Float[Array, "n 3 3"] | None = real_field(default=None)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_axes(self)
 
     def __len__(self) -> int:
@@ -118,7 +118,7 @@ class RenderConfig(eqx.Module):
     # splat unless given (`required_capacity` finds it). Pairs that do not fit are counted in Frame.overflow
     differentiation: str = static_field(default="reverse", choices=("reverse", "forward"))
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_fields(self)
         if self.alpha_min >= self.alpha_max:
             raise InputError(
