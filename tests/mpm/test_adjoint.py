@@ -196,9 +196,8 @@ def test_integers_of_the_state_pass(x64):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), found, expected)
 
 
-@pytest.mark.parametrize(
-    "contact", [None, pytest.param(BodyContact(2, friction=0.3), marks=pytest.mark.slow)], ids=["one field", "contact"]
-)
+@pytest.mark.slow  # test_reference.py holds the derivatives of one field
+@pytest.mark.parametrize("contact", [None, BodyContact(2, friction=0.3)], ids=["one field", "contact"])
 def test_reverse_mode_of_a_rollout_is_jaxs_own_of_the_plain_loops(x64, contact):
     """Two laws, one of them of two materials, on a moving plane with friction; blocks of 4 and 3 steps."""
     x = np.stack(np.meshgrid(*[np.arange(4) * 0.05] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.3

@@ -191,6 +191,7 @@ def test_a_sweep_of_the_clamp_simulates_once(folder, tmp_path, monkeypatch):
     assert table["largest"][2] > table["largest"][1] > 1.01
 
 
+@pytest.mark.slow
 def test_tuning_finds_the_throw_that_hits(folder, tmp_path):
     # without contact the middle flies a parabola: x = x0 + v t, z = z0 + v t - g t² / 2
     scene = {**SCENE, "planes": {}}
