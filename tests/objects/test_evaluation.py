@@ -188,7 +188,7 @@ def test_a_georeferenced_data_set_is_scored_once_its_origin_is_given(tmp_path):
     write_folder(tmp_path, "views")
     gaussians, labels = scene()
     origin = (500_000.0, 4_600_000.0, 100.0)
-    save_ply(tmp_path / "scene.ply", gaussians, origin=origin)
+    io.save_ply(tmp_path / "scene.ply", gaussians, origin=origin)
     content = json.loads((tmp_path / "transforms.json").read_text())
     for frame in content["frames"]:
         for row, offset in zip(frame["transform_matrix"], origin):
@@ -196,7 +196,7 @@ def test_a_georeferenced_data_set_is_scored_once_its_origin_is_given(tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=r"give origin=\(500000, 4600000, "):
         load_dataset(tmp_path, "views")
-    votes, confidence = np.zeros((len(gaussians), 1)), np.zeros(len(gaussians))
+    votes, confidence = np.zeros((len(gaussians), 1 + max(NEAR, FAR))), np.zeros(len(gaussians))
     io.save_labels(tmp_path / "labels.npz", labels.object_id, votes, confidence, scene="of the file")
     scores = run(tmp_path, "views", "--labels", tmp_path / "labels.npz", "--origin", *origin)
     assert scores["levels"]["visible"]["mean_iou"] == pytest.approx(1.0)
@@ -211,9 +211,8 @@ def test_prompts_masks_labels_and_reference_may_be_given(tmp_path):
     assert scores["levels"]["isolated"]["prompts"]["near"]["iou"] == pytest.approx(48 / 484)
     # labels with other ids, grounded in the second test view; a prompt that is not to be seen there is missing
     object_id = np.where(np.asarray(scene()[1].object_id) == NEAR, 40, 30)
-    np.savez(
-        tmp_path / "labels.npz", object_id=object_id, votes=np.zeros((len(object_id), 1)), confidence=0.0 * object_id
-    )
+    votes, confidence = np.zeros((len(object_id), 3)), np.zeros(len(object_id))
+    io.save_labels(tmp_path / "labels.npz", object_id, votes, confidence, np.array([0, 30, 40]))
     (tmp_path / "test_mask/1/near.png").unlink()
     scores = run(tmp_path, "lerf-mask", "--labels", tmp_path / "labels.npz", "--reference", "v3", "--overwrite")
     assert scores["objects"] == {"far": 30, "near": None}
