@@ -289,7 +289,9 @@ def test_foam_solves_its_flow_rule_over_the_range_of_exponents_and_times(x64):
         lambda leaf: jnp.full(h.shape, leaf), parameters("foam", yield_stress=1.0, viscosity=20.0, flow_exponent=1.0)
     )
     m = eqx.tree_at(lambda m: m.flow_exponent, m, jnp.asarray(h))
-    left, slope = jax.jit(lambda x: jax.jvp(lambda x: _relaxed(x, impulse, m), (x,), (jnp.ones_like(x),)))(excess)
+    left, slope = jax.jit(lambda x: jax.jvp(lambda x: _relaxed(x, jnp.asarray(impulse), m), (x,), (jnp.ones_like(x),)))(
+        excess
+    )
 
     low, high = np.zeros_like(excess), excess
     for _ in range(60):  # bisection
