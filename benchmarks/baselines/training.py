@@ -1,6 +1,5 @@
 """One training loop for the learnt baselines: Adam, one random view a step, geometry fixed."""
 
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -8,6 +7,7 @@ import jax
 import numpy as np
 import optax
 
+from benchmarks.common.timing import clock
 from pigjax.core.camera import Camera
 from pigjax.io import Views
 from pigjax.splat import Gaussians, RenderConfig, render
@@ -56,16 +56,19 @@ def fit(
     state = optimizer.init(params)
     compiled = advance.lower(params, state, *inputs[0], 0, keys[0]).compile()
 
-    kept, losses = {}, []
     checkpoints = {max(1, round(share * steps)) for share in CHECKPOINTS}
-    begun = time.perf_counter()
-    for step, (view, key) in enumerate(zip(order, keys)):
-        params, state, value = compiled(params, state, *inputs[view], step, key)
-        losses.append(value)
-        if step + 1 in checkpoints:
-            kept[step + 1] = params
-    losses = np.asarray(jax.block_until_ready(losses))
-    return Fitted(kept, losses, time.perf_counter() - begun)
+
+    def train(params, state):
+        kept, losses = {}, []
+        for step, (view, key) in enumerate(zip(order, keys)):
+            params, state, value = compiled(params, state, *inputs[view], step, key)
+            losses.append(value)
+            if step + 1 in checkpoints:
+                kept[step + 1] = params
+        return kept, losses
+
+    seconds, (kept, losses) = clock(lambda: train(params, state))
+    return Fitted(kept, np.asarray(losses), seconds)
 
 
 def draw(gaussians: Gaussians, features: jax.Array, camera: Camera) -> jax.Array:
