@@ -167,7 +167,7 @@ class Collider(eqx.Module):
             return jnp.where(inside, touched, velocity)
         return velocity + inside * (touched - velocity)
 
-    def _allowed(self, relative: Points, normal: Points, press: Press | None) -> Points:
+    def _allowed(self, relative: Points, normal: Float[Array, "*#n 3"], press: Press | None) -> Points:
         """Velocities relative to the collider [m/s] that its mode leaves of others."""
         if self.mode == "sticky":
             return jnp.zeros_like(relative)
