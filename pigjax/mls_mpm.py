@@ -45,7 +45,7 @@ from pigjax.core.arrays import is_known
 from pigjax.core.errors import InputError
 from pigjax.mpm import Grid, Health, Particles, SimConfig, StepHealth, Trajectory
 from pigjax.mpm.colliders import Collider
-from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.contact import BodyContact, broken_by
 from pigjax.mpm.materials import MaterialTable
 from pigjax.mpm.program import StepInputs
 from pigjax.mpm.simulate import collect, simulate, simulate_compiled
@@ -251,11 +251,8 @@ def _check_table(particles: Particles, table: MaterialTable) -> None:
 def _check_contact(particles: Particles, config: SimConfig, contact: BodyContact | None) -> None:
     if contact is None:
         return
-    if config.integrator != "explicit":
-        raise InputError(
-            f"SimConfig.integrator = {config.integrator!r} knows no contact between bodies: use 'explicit' steps, or"
-            " contact=None."
-        )
+    if (rule := broken_by(config.integrator)) is not None:
+        raise InputError(f"SimConfig.integrator = {config.integrator!r}: {rule}, or give contact=None.")
     if is_known(particles.body):
         body = np.asarray(particles.body)  # known also where jit closes over it
         low, high = int(body.min()), int(body.max())
