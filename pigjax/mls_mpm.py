@@ -1,7 +1,7 @@
 """MLS-MPM with APIC: one step (`step`) and whole rollouts (`rollout`).
 
-One substep for particles p with mass m, rest volume V, position x, velocity v, affine velocity C, deformation gradient
-F and Kirchhoff stress τ, for nodes i with B-spline weights wᵢₚ, and D = dx²/4 (quadratic) or dx²/3 (cubic):
+One substep for particles p with mass m, rest volume V, position x, velocity v, velocity gradient C, deformation
+gradient F and Kirchhoff stress τ, for nodes i with B-spline weights wᵢₚ, and D = dx²/4 (quadratic) or dx²/3 (cubic):
 
     P2G          mᵢ = Σₚ wᵢₚ mₚ                                                    transfers, chunked
                  (m v)ᵢ = Σₚ wᵢₚ (mₚ vₚ + (mₚ Cₚ − Δt Vₚ τₚ D⁻¹) (xᵢ − xₚ))
@@ -137,10 +137,11 @@ def rollout(
 ) -> tuple[Particles, Trajectory, Health]:
     """Simulate frames of substeps.
 
-    With concrete arrays, only the active part of the grid is allocated. Inside jit, grad and vmap the whole grid is, or
-    a window of `config.box` nodes that moves with matter: give a grid that `fit_grid` has fitted. Reverse mode keeps
-    O(√n) checkpoints of n steps and recomputes the states between them (Griewank and Walther 2000), and with a window
-    also the inputs of each frame.
+    With concrete arrays, only the active part of the grid is allocated; a domain of at most 50,000 nodes is held whole
+    unless `sleep` is given. Inside jit, grad and vmap the whole grid is allocated, or a window of `config.box` nodes
+    that moves with matter: give a grid that `fit_grid` has fitted. Reverse mode keeps O(√n) checkpoints of n steps, at
+    least one for each frame, and recomputes the states between them (Griewank and Walther 2000); with a window it also
+    keeps the inputs of each frame.
 
     Args:
         particles: p of them, in any order of materials.
