@@ -22,8 +22,8 @@ einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 def as_array(value: Any) -> Any:
     """Turn Python floats, sequences and NumPy arrays into JAX arrays; leave tracers, None and axis numbers alone.
 
-    Integers beyond the range of JAX's become floats, which JAX would otherwise wrap around. Values that
-    make no array of numbers stay as they are, for the checks of the field.
+    Integers beyond the range of JAX's become floats, which JAX would otherwise wrap around. Values that make
+    no array of numbers stay as they are, for the checks of the field.
     """
     if not isinstance(value, float | list | tuple | np.ndarray | np.generic):
         return value

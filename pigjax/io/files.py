@@ -132,7 +132,8 @@ def write_json(path: PathLike, content: Any) -> None:
 def writing(path: PathLike) -> Iterator[Path]:
     """Give a temporary path beside `path` that takes its place when the block ends well.
 
-    A killed process leaves the former file, or none, but never a torn one; its temporary file is removed by the next writer of the same file, or by `output_folder`. A link is replaced, not followed.
+    A killed process leaves the former file, or none, but never a torn one; its temporary file is
+    removed by the next writer of the same file, or by `output_folder`. A link is replaced, not followed.
 
     Raises:
         InputError: the folder or file cannot be written.
