@@ -1,7 +1,7 @@
 """MLS-MPM with APIC: one step (`step`) and whole rollouts (`rollout`).
 
-One substep for particles p with mass m, rest volume V, position x, velocity v, affine velocity C, deformation gradient
-F and Kirchhoff stress τ, for nodes i with B-spline weights wᵢₚ, and D = dx²/4 (quadratic) or dx²/3 (cubic):
+One substep for particles p with mass m, rest volume V, position x, velocity v, velocity gradient C, deformation
+gradient F and Kirchhoff stress τ, for nodes i with B-spline weights wᵢₚ, and D = dx²/4 (quadratic) or dx²/3 (cubic):
 
     P2G          mᵢ = Σₚ wᵢₚ mₚ                                                    transfers, chunked
                  (m v)ᵢ = Σₚ wᵢₚ (mₚ vₚ + (mₚ Cₚ − Δt Vₚ τₚ D⁻¹) (xᵢ − xₚ))
@@ -45,7 +45,7 @@ from pigjax.core.arrays import is_known
 from pigjax.core.errors import InputError
 from pigjax.mpm import Grid, Health, Particles, SimConfig, StepHealth, Trajectory
 from pigjax.mpm.colliders import Collider
-from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.contact import BodyContact, broken_by
 from pigjax.mpm.materials import MaterialTable
 from pigjax.mpm.program import StepInputs
 from pigjax.mpm.simulate import collect, simulate, simulate_compiled
@@ -137,10 +137,11 @@ def rollout(
 ) -> tuple[Particles, Trajectory, Health]:
     """Simulate frames of substeps.
 
-    With concrete arrays, only the active part of the grid is allocated. Inside jit, grad and vmap the whole grid is, or
-    a window of `config.box` nodes that moves with matter: give a grid that `fit_grid` has fitted. Reverse mode keeps
-    O(√n) checkpoints of n steps and recomputes the states between them (Griewank and Walther 2000), and with a window
-    also the inputs of each frame.
+    With concrete arrays, only the active part of the grid is allocated; a domain of at most 50,000 nodes is held whole
+    unless `sleep` is given. Inside jit, grad and vmap the whole grid is allocated, or a window of `config.box` nodes
+    that moves with matter: give a grid that `fit_grid` has fitted. Reverse mode keeps O(√n) checkpoints of n steps, at
+    least one for each frame, and recomputes the states between them (Griewank and Walther 2000); with a window it also
+    keeps the inputs of each frame.
 
     Args:
         particles: p of them, in any order of materials.
@@ -251,11 +252,8 @@ def _check_table(particles: Particles, table: MaterialTable) -> None:
 def _check_contact(particles: Particles, config: SimConfig, contact: BodyContact | None) -> None:
     if contact is None:
         return
-    if config.integrator != "explicit":
-        raise InputError(
-            f"SimConfig.integrator = {config.integrator!r} knows no contact between bodies: use 'explicit' steps, or"
-            " contact=None."
-        )
+    if (rule := broken_by(config.integrator)) is not None:
+        raise InputError(f"SimConfig.integrator = {config.integrator!r}: {rule}, or give contact=None.")
     if is_known(particles.body):
         body = np.asarray(particles.body)  # known also where jit closes over it
         low, high = int(body.min()), int(body.max())

@@ -1,6 +1,6 @@
 """Drawing: `render` and `surface_depth` (Kerbl et al. 2023).
 
-`render` reads project → shade → bin → composite:
+`render` rasterizes splats; it reads project → shade → bin → composite:
 
 1. project (`splatting.projection`): each Gaussian becomes an ellipse on the image plane (EWA splatting);
 2. shade (`splatting.sh`): its colour in the direction of the camera, and whatever else is to be composited;

@@ -56,8 +56,8 @@ def evaluate_files(
         reference: name of that view, which also overrules the data set's names; if not given, the view with most
             prompts.
         fill: give Gaussians that no view saw the id of their neighbours.
-        origin: what was subtracted from the scene's positions [m]. With one, labels are not compared with the Gaussians
-            of their file, whose positions these no longer are. None: nothing was.
+        origin: vector that was subtracted from the scene's positions [m]; None: none was. With one, labels are not
+            compared with the Gaussians of their file, which has other positions.
         progress: called with the stage, steps done and of all.
         overwrite: replace scores of something else in `out`, instead of refusing them.
         settings: of `lift_masks`.

@@ -22,8 +22,8 @@ einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 def as_array(value: Any) -> Any:
     """Turn Python floats, sequences and NumPy arrays into JAX arrays; leave tracers, None and axis numbers alone.
 
-    Integers beyond the range of JAX's become floats, which JAX would otherwise wrap around. What is no array of
-    numbers stays as it is, for the checks of the field.
+    Integers beyond the range of JAX's become floats, which JAX would otherwise wrap around. Values that make
+    no array of numbers stay as they are, for the checks of the field.
     """
     if not isinstance(value, float | list | tuple | np.ndarray | np.generic):
         return value
@@ -40,7 +40,7 @@ def as_array(value: Any) -> Any:
 
 
 def as_real_array(value: Any) -> Any:
-    """As `as_array`, with arrays of integers made real: what is computed from them takes their type."""
+    """As `as_array`, with arrays of integers made real: results computed from them take their type."""
     value = as_array(value)
     return value.astype(float) if isinstance(value, Array) and jnp.issubdtype(value.dtype, jnp.integer) else value
 

@@ -146,7 +146,7 @@ def is_numeric(value: Any) -> bool:
 def check_axes(thing: Any) -> None:
     """Check that arrays have the axes of their annotations, and one length where the names of axes are the same.
 
-    What is no array passes, such as None and the axes that `jax.vmap` is told.
+    Values that are no arrays pass: None, and the axis numbers that `jax.vmap` is given.
 
     Raises:
         InputError: an array has other axes, or another length than one before it.
@@ -181,7 +181,7 @@ def _misshapen(value: Any, kind: str) -> bool:
 
 
 def _axes_of(kind: str) -> tuple[str, ...] | None:
-    """Names or lengths of the axes in an annotation such as "Float[Array, '*batch 4 4']"; None for what is no array."""
+    """Names or lengths of the axes in an annotation such as "Float[Array, '*batch 4 4']"; None for other types."""
     found = re.fullmatch(r"(?:Float|Int)\[\w+, ['\"]([^'\"]*)['\"]\]", kind)
     return None if found is None else tuple(found[1].split())
 

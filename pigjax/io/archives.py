@@ -106,7 +106,7 @@ def load_array(
         path: of the file.
         what: the kind of file, for messages.
         remedy: what the reader of a message can do.
-        check: told shape and type before the array is read; what it raises comes through.
+        check: told shape and type before the array is read; its exceptions come through.
 
     Raises:
         MissingFileError: there is no such file.

@@ -132,7 +132,7 @@ def write_json(path: PathLike, content: Any) -> None:
 def writing(path: PathLike) -> Iterator[Path]:
     """Give a temporary path beside `path` that takes its place when the block ends well.
 
-    A killed process leaves the former file, or none, but never a torn one; what it leaves of the temporary file is
+    A killed process leaves the former file, or none, but never a torn one; its temporary file is
     removed by the next writer of the same file, or by `output_folder`. A link is replaced, not followed.
 
     Raises:
@@ -299,7 +299,7 @@ def _remove_leftovers(folder: Path, mark: str | None = None, suffix: str | None 
 _LONGEST_NAME = 60  # bytes
 _LONGEST_MARK = 100  # bytes
 _PARTIAL = re.compile(r"\.pigjax-(?P<process>[1-9]\d{0,9})-(?P<mark>.*)", re.DOTALL)
-# how version 0.1 named them; only names that nobody else gives, since what matches is removed
+# another form that folders may hold; only names that no other program gives, since matching files are removed
 _STATE_PARTIAL = re.compile(r"\.(?P<mark>\d{6}|last|video|fit|search)\.(?P<process>[1-9]\d{0,9})\.(npz|ckpt|mp4)")
 
 

@@ -143,7 +143,7 @@ def load_pytree(path: PathLike, like: Tree, *, parts: Parts | None = None) -> Tr
         InputError: the file is damaged, or its leaves are not those of `like`.
     """
     path = existing(path, "checkpoint")
-    with decoding(path, "checkpoint", remedy="delete it, and what it kept is computed again"):
+    with decoding(path, "checkpoint", remedy="delete it, and its contents are computed again"):
         head, _, payload = path.read_bytes().partition(b"\n")
         told = json.loads(head)
         found = {str(name): str(value) for name, value in told["parts"].items()}
@@ -205,7 +205,7 @@ def set_aside(path: PathLike, error: InputError) -> None:
     """Rename a damaged file, and warn."""
     path = Path(path)
     aside = path.with_name(path.name + ".damaged")
-    warnings.warn(f"{error} It is kept as {aside.name}, and what it held is computed again.", stacklevel=3)
+    warnings.warn(f"{error} It is kept as {aside.name}, and its contents are computed again.", stacklevel=3)
     with writing(aside) as partial:
         os.replace(path, partial)
 

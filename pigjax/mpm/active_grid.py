@@ -77,7 +77,7 @@ class ActiveGrid:
         self.shape = int(nx), int(ny), int(nz)
 
     def _window(self, ends: Float[np.ndarray, "2 3"], count: int, domain: Grid) -> GridWindow:
-        """The window around the corners `ends` [m] of where matter is and is heading."""
+        """The window around the present and coming positions of matter, whose bounds are `ends` [m]."""
         if (ends[0] > ends[1]).any():  # no particle is finite
             ends = np.tile(np.asarray(domain.origin, np.float64), (2, 1))
         sides = np.array(domain.shape)

@@ -3,7 +3,8 @@
 The forward pass keeps one checkpoint, the state, at the beginning of each block of steps. The backward pass goes
 through the blocks from the last to the first: it recomputes the states of one block from its checkpoint, and
 back-propagates the cotangents step by step. A step has two halves, and the value between them (the grid) is kept with
-the states of the block that is being back-propagated, so that neither half runs again.
+the states of the block that is being back-propagated, so that the derivative of each half starts from stored inputs.
+Within a half the chunks of particles are recomputed (`chunked`).
 """
 
 from __future__ import annotations

@@ -21,6 +21,14 @@ _TOUCHING = 0.9
 _SHARED = 0.1  # least share of a body in the volume at a node of contact: a smaller one is only the edge of the body
 
 
+def broken_by(integrator: str) -> str | None:
+    """The rule that an integrator breaks in contact between bodies; None: it keeps it.
+
+    Implicit steps balance one velocity field, and "auto" may choose them.
+    """
+    return None if integrator == "explicit" else "contact between bodies needs explicit steps; take 'explicit'"
+
+
 class BodyContact(eqx.Module):
     """Contact between the bodies that `Particles.body` tells apart.
 

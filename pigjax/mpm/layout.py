@@ -24,7 +24,7 @@ class State(NamedTuple):
     cells: Rows  # position in cells from the first node, 3 rows
     rounded: Rows  # rounding error of the cells so far, 3 (Kahan 1965, doi 10.1145/363707.363723)
     v: Rows  # [m/s], 3
-    C: Rows  # velocity gradient [1/s], 9
+    C: Rows  # velocity gradient, by APIC [1/s], 9
     F: Rows  # elastic deformation gradient, 9
     stress: Rows  # Kirchhoff, of F [Pa], 9: the law computes it together with F
     mass: Rows  # [kg], 1; 0 for particles that are no longer finite

@@ -123,8 +123,8 @@ def run_frames(
         dt=inputs.dt,
         gravity=inputs.gravity,
         colliders=inputs.colliders,
-        contacts=tuple(None if c.moves else c.contact(points) for c in inputs.colliders),
-        contact=contact,
+        collider_contacts=tuple(None if c.moves else c.contact(points) for c in inputs.colliders),
+        body_contact=contact,
         specific_volume=None if contact is None else _specific_volume(particles, contact.bodies) / grid.dx**3,
         frozen=None if still is None else touched_nodes(grid, still.x, kernel),
         unit_mass=lax.stop_gradient(jnp.where(jnp.isfinite(particles.mass), particles.mass, 0).max()),
@@ -225,8 +225,8 @@ def _checkpointed_steps(
         jax.tree.map(lambda _: False, state)._replace(**dict.fromkeys(names, True))
         for state, names in zip(states, fixed)
     )
-    # Memory is least where blocks have the root of all steps. Of a single frame the last block is not recomputed, so
-    # that longer ones save time.
+    # Memory is least where a block has as many steps as the root of all steps. In a single frame the last block is not
+    # recomputed, so that longer blocks save time.
     most = math.isqrt((2 if frames == 1 else 1) * frames * substeps)
     block = -(-substeps // -(-substeps // most))
     perfect = partial(StepHealth.perfect, context.dt.dtype)

@@ -1,4 +1,4 @@
-"""Plain MLS-MPM on dense arrays: the twin of `substep`, to read and to test the fast path against.
+"""Plain MLS-MPM on dense arrays: the stages of `substep`, to read and to test the fast path against.
 
 No chunks, window, devices or derivative rules: equations as in the `mls_mpm` docstring, one line each. It covers
 explicit steps of every law with colliders and walls, and no contact between bodies.
@@ -34,8 +34,7 @@ def substep(
 ) -> Particles:
     """One explicit step of dt [s] under gravity [m/s²], begun a time [s] after the colliders were where they say."""
     mass, momentum, frozen = particles_to_grid(particles, grid, table, config, dt)
-    velocity = jnp.where(mass > 0, momentum / jnp.where(mass > 0, mass, 1.0) + dt * gravity, 0.0)
-    velocity = update_grid(velocity, frozen, grid, config, colliders, time)
+    velocity = update_grid(mass, momentum, frozen, grid, config, dt, gravity, colliders, time)
     return grid_to_particles(particles, velocity, grid, table, config, dt)
 
 
@@ -63,14 +62,18 @@ def particles_to_grid(
 
 
 def update_grid(
-    velocity: Float[Array, "x y z 3"],
+    mass: Float[Array, "x y z 1"],
+    momentum: Float[Array, "x y z 3"],
     frozen: Bool[Array, "x y z"],
     grid: Grid,
     config: SimConfig,
+    dt: Float[Array, ""] | float,
+    gravity: Float[Array, "3"],
     colliders: tuple[Collider, ...],
     time: Time,
 ) -> Float[Array, "x y z 3"]:
-    """Node velocities [m/s] after colliders, stationary matter and walls."""
+    """Grid update: node velocities [m/s] after gravity, colliders, stationary matter and walls."""
+    velocity = jnp.where(mass > 0, momentum / jnp.where(mass > 0, mass, 1.0) + dt * gravity, 0.0)
     for collider in colliders:
         velocity = collider.apply(collider.contact(grid.points, time), velocity)
     velocity = jnp.where(frozen[..., None], 0.0, velocity)

@@ -1,6 +1,7 @@
-"""The frame loop: a generator on the host, and its twin of one compiled program inside jit, grad and vmap.
+"""The frame loop: a generator on the host (`simulate`), or one compiled program (`simulate_compiled`).
 
-`rollout`, `pigjax run`, experiments and sleeping bodies all iterate over `simulate`.
+`pigjax run` iterates over `simulate`, and so does `rollout` with concrete arrays, unless the domain is small. Small
+domains and calls inside jit, grad and vmap take `simulate_compiled`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from pigjax.mpm.program import StepInputs, run_frames
 from pigjax.mpm.timestep import SubstepRule
 
 
-class Frame(NamedTuple):
+class SimulatedFrame(NamedTuple):
     """The result of one frame."""
 
     number: int  # frames since the start, 1 for the first
@@ -44,7 +45,7 @@ def simulate(
     colliders: tuple[Collider, ...] = (),
     contact: BodyContact | None = None,
     active_grid: ActiveGrid | None = None,
-) -> Iterator[Frame]:
+) -> Iterator[SimulatedFrame]:
     """Simulate and yield frame after frame (host).
 
     With `SimConfig.stop` the first bad frame is the last one: it repeats the particles of the last good frame.
@@ -78,12 +79,12 @@ def simulate(
         if stops and path is not None:  # the last good frame to the digit: another window would round positions again
             particles, moved = before, path
         path = moved
-        yield Frame(frame + 1, particles, path, health)
+        yield SimulatedFrame(frame + 1, particles, path, health)
         if stops:
             return
 
 
-def collect(frames: Iterable[Frame], count: int) -> tuple[Particles, Trajectory, Health]:
+def collect(frames: Iterable[SimulatedFrame], count: int) -> tuple[Particles, Trajectory, Health]:
     """Particles after the last frame, the joined path, and the worst health of frames from the first on (host).
 
     Where there are fewer than `count` frames, which is at least 1, the path repeats the last one.

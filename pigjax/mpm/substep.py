@@ -1,7 +1,7 @@
 """One substep of MLS-MPM with APIC: `particles_to_grid` (P2G), `update_grid`, `grid_to_particles` (G2P).
 
 The same three functions serve forward simulation and the adjoint, which keeps the grid between the first and the
-second. `reference.py` is the plain twin, with the same names and without chunks or devices.
+second. `reference.py` has the same stages under the same names in plain form, without chunks or devices.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ class StepContext(NamedTuple):
     dt: Float[Array, ""]  # [s]
     gravity: Float[Array, "3"]  # [m/s²]
     colliders: tuple[Collider, ...]
-    contacts: tuple[Contact | None, ...]  # of the colliders that do not move
-    contact: BodyContact | None  # between bodies, each of which has a grid of its own beside the others
+    collider_contacts: tuple[Contact | None, ...]  # of the colliders that do not move; None: found at each step
+    body_contact: BodyContact | None  # between bodies, each of which has a grid of its own beside the others
     specific_volume: Float[Array, "b"] | None  # of each body, on average [cells/kg]
     frozen: Bool[Array, "nx ny nz"] | None  # nodes that stationary matter touches
     unit_mass: Float[Array, ""]  # of the heaviest particle [kg]
@@ -78,7 +78,7 @@ class StepContext(NamedTuple):
     @property
     def bodies(self) -> int:
         """Grids side by side."""
-        return 1 if self.contact is None else self.contact.bodies
+        return 1 if self.body_contact is None else self.body_contact.bodies
 
     @property
     def nodes(self) -> tuple[int, int, int]:
@@ -129,7 +129,7 @@ def update_grid(
         if statics.solve_balance is not None:
             return statics.solve_balance(statics, context, states, nodes, time)
         _, velocity = free_velocity(context, nodes)
-        if context.contact is not None:
+        if context.body_contact is not None:
             velocity = _separate_bodies(statics, context, states, nodes, velocity)
         return apply_boundaries(statics, context, velocity, time=time), True
 
@@ -141,7 +141,7 @@ def grid_to_particles(
     velocity: Float[Array, "x y z 3"],
     converged: Bool[Array, ""] | bool,
 ) -> tuple[tuple[State, ...], StepHealth]:
-    """G2P: the particles' velocities, affine momentum, positions and deformation after the step, and its health.
+    """G2P: the particles' velocities, velocity gradients, positions and deformation after the step, and its health.
 
     vₚ = Σ wᵢₚ vᵢ, Cₚ = D⁻¹ Σ wᵢₚ vᵢ (xᵢ − xₚ)ᵀ, xₚ += Δt vₚ, and the law's F from (I + Δt Cₚ) F.
     """
@@ -327,7 +327,7 @@ def free_velocity(
     context: StepContext, nodes: Float[Array, "n y z 4"]
 ) -> tuple[Bool[Array, "*b x y z 1"], Float[Array, "*b x y z 3"]]:
     """Which nodes have mass, and their velocities [m/s] under gravity, before any contact."""
-    if context.contact is not None:
+    if context.body_contact is not None:
         nodes = nodes.reshape(context.bodies, *context.grid.shape, 4)
     mass = nodes[..., :1] / context.unit_mass
     # Below this a node's mass squared, by which derivatives divide, leaves the range of floating point.
@@ -344,7 +344,7 @@ def _separate_bodies(
     velocity: Float[Array, "b x y z 3"],
 ) -> Float[Array, "b x y z 3"]:
     """Velocities after contact between bodies. P2G brings the place of their matter to the grid as it does momentum."""
-    assert context.contact is not None
+    assert context.body_contact is not None
     assert context.specific_volume is not None
     width = context.grid.shape[0]
 
@@ -357,7 +357,7 @@ def _separate_bodies(
     apart = (context.bodies, *context.grid.shape, 4)
     mass = nodes.reshape(apart)[..., :1]
     specific = context.specific_volume[:, None, None, None, None]
-    return context.contact.part(
+    return context.body_contact.part(
         velocity, mass / context.unit_mass, specific * mass, specific * moment.reshape(apart)[..., 1:]
     )
 
@@ -379,7 +379,7 @@ def apply_boundaries(
         time: since the colliders were where their numbers say [s].
         press: how nodes press against each collider, if friction must follow that; None: by their velocity.
     """
-    for k, (collider, contact) in enumerate(zip(context.colliders, context.contacts)):
+    for k, (collider, contact) in enumerate(zip(context.colliders, context.collider_contacts)):
         contact = collider.contact(context.grid.points, time) if contact is None else contact
         velocity = collider.apply(contact, velocity, None if press is None else press[k])
     if context.frozen is not None:

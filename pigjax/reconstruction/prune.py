@@ -51,7 +51,7 @@ def prune(
 ) -> Gaussians:
     """The `budget` Gaussians that contribute most to these views, in their old order. Host.
 
-    `python -m benchmarks prune` measures what that costs in picture quality, and what it saves in time.
+    `python -m benchmarks prune` measures the loss of picture quality and the time saved.
 
     Args:
         gaussians: the scene.

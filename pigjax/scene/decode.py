@@ -20,7 +20,7 @@ class Section(Struct, forbid_unknown_fields=True, frozen=True):
     """A table of a file. Its fields' annotations hold types, choices and `Limits`."""
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
-        """Rules between fields: the field to name, whether it holds, and the rule in words."""
+        """Rules between fields: the dotted field to name, whether the rule holds, and the rule in words."""
         return ()
 
 
@@ -52,7 +52,9 @@ def decode(values: Any, kind: type[S], name: str = "", **given: Any) -> S:
     made = kind(**{key: _value(value, known[key].type, joined(name, key)) for key, value in values.items()}, **given)
     for broken, holds, rule in made.rules():
         if not holds:
-            value = getattr(made, broken, None)
+            value: Any = made
+            for part in broken.split("."):
+                value = getattr(value, part, None)
             said = f" = {shown(value)}" if isinstance(value, int | float | str | tuple) else ""
             raise SceneError(f"{joined(name, broken)}{said}: {rule}.")
     return made

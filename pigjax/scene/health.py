@@ -12,16 +12,15 @@ from jaxtyping import Float
 from pigjax.mpm import Health, Particles
 
 Record: TypeAlias = dict[str, np.ndarray]  # numbers of one frame, by name
-MARK = "health_"  # what names of a record begin with in a state file
+MARK = "health_"  # prefix of a record's names in a state file
 _GAIN = 0.05  # energy that appears from nowhere, relative to the largest kinetic energy, beyond what steps round off
-_MOST = ("escaped", "inverted", "wall_hits")  # counts of what may recover: the most at one time
+_MOST = ("escaped", "inverted", "wall_hits")  # counts that may fall again: the most at one time
 
 
 def health_record(particles: Particles, health: Health | None, gravity: Float[np.ndarray, "3"]) -> Record:
     """Health of a frame, None at the start, and the energy and momentum after it.
 
-    Energies are kinetic, and that of gravity from the world's origin; what matter stores by its stretches is not
-    among them.
+    Energies are the kinetic one and that of gravity from the world's origin; elastic energy is not among them.
     """
     numbers = () if health is None else fields(Health)
     record = {field.name: np.asarray(getattr(health, field.name)) for field in numbers if field.name != "sides_met"}

@@ -65,27 +65,25 @@ def read_inputs(scene: Scene) -> Inputs:
 
     Raises:
         InputError: a file is missing or damaged.
-        SceneError: an object has no id.
+        SceneError: an object has no id of its own, or `camera.view` is not the name of a photo.
     """
     spec = scene.input
+    names = {} if spec.names is None else io.load_names(scene.path(spec.names))
+    ids = {name: _id_of(name, scene, names) for name in scene.objects}
+    _check_ids(ids)
     gaussians = io.load_gaussians(scene.path(spec.gaussians), drop_invalid=spec.drop_invalid, origin=spec.origin)
     views = None
     if spec.views is not None:
         masks = True if spec.masks is None else scene.path(spec.masks)
         views = io.load_views(scene.path(spec.views), masks=masks, max_size=spec.max_size, origin=spec.origin)
-    names = {} if spec.names is None else io.load_names(scene.path(spec.names))
-    ids = {name: _id_of(name, scene, names) for name in scene.objects}
-    _check_ids(ids)
+    if scene.camera.view is not None:
+        _camera_of_view(scene.camera, views)
     return Inputs(gaussians, views, ids, names)
 
 
 def _id_of(name: str, scene: Scene, names: dict[int, str]) -> int:
     own = scene.objects[name].id
     if own is not None:
-        if not 0 <= own < 2**31:
-            raise SceneError(
-                f"objects.{name}.id = {own}: must lie from 0 to 2³¹ - 1; give the object's id in the masks."
-            )
         return own
     found = io.id_named(name, names)
     if found is None:
@@ -106,12 +104,10 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
     """Objects of the Gaussians, by the masks; without masks all belong to the only object.
 
     Raises:
-        SceneError: several objects and no masks, or an object that no Gaussian belongs to.
+        SceneError: no Gaussian belongs to an object.
     """
     spec = scene.segmentation
     if inputs.views is None:
-        if len(inputs.ids) > 1:
-            raise SceneError("input.views is missing: several objects can be told apart by masks only.")
         (only,) = inputs.ids.values()
         count = len(inputs.gaussians)
         ids = jnp.asarray(sorted({0, only}), jnp.int32)
@@ -212,8 +208,6 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
 def _contact(spec: SimulationSpec, bodies: int) -> BodyContact | None:
     if spec.contact_friction is None or bodies < 2:
         return None
-    if not spec.contact_friction >= 0:
-        raise SceneError(f"simulation.contact_friction = {spec.contact_friction}: must be >= 0.")
     return BodyContact(bodies=bodies, friction=jnp.asarray(spec.contact_friction))
 
 
@@ -272,7 +266,7 @@ def make_cameras(scene: Scene, inputs: Inputs, focus: Float[np.ndarray, "3"]) ->
     spec, frames = scene.camera, scene.simulation.frames + 1
     width, height = (max(round(side * scene.drawing.scale), 1) for side in (spec.width, spec.height))
     if spec.view is not None:
-        return stack_cameras([_camera_of_view(spec, inputs).resized(width, height)] * frames)
+        return stack_cameras([_camera_of_view(spec, inputs.views).resized(width, height)] * frames)
     target = np.array(spec.target) if spec.target is not None else focus
     focal = width / (2 * np.tan(np.radians(spec.field_of_view) / 2))
     radius = spec.radius if spec.radius is not None else _default_radius(inputs.gaussians, target)
@@ -308,17 +302,17 @@ def render_config(scene: Scene) -> RenderConfig:
     )
 
 
-def _camera_of_view(spec: CameraSpec, inputs: Inputs) -> Camera:
-    if inputs.views is None or spec.view not in inputs.views.names:
-        names = () if inputs.views is None else inputs.views.names
+def _camera_of_view(spec: CameraSpec, views: io.Views | None) -> Camera:
+    names = () if views is None else views.names
+    if views is None or spec.view not in names:
         raise SceneError(f"camera.view = {spec.view!r}: {suggest(str(spec.view), names)}.")
-    return inputs.views.cameras[inputs.views.names.index(spec.view)]
+    return views.cameras[names.index(spec.view)]
 
 
 def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
     """Parts that the simulated states depend on; the camera, the clamp and the video do not count.
 
-    Nor does the name of the accuracy, but what it set; files count by their content.
+    Nor does the name of the accuracy count, but the values that it set do; files count by their content.
     """
     settings: dict[str, Any] = msgspec.to_builtins(scene)
     for name in ("accuracy", "camera", "clamp", "drawing", "folder"):

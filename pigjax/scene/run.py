@@ -21,7 +21,7 @@ from pigjax.core.errors import SimulationError, StaleError
 from pigjax.coupling.binding import deform
 from pigjax.mpm import Particles, vast_grid
 from pigjax.mpm.active_grid import ActiveGrid
-from pigjax.mpm.simulate import Frame, simulate
+from pigjax.mpm.simulate import SimulatedFrame, simulate
 from pigjax.mpm.sleep import Sleeper
 from pigjax.mpm.timestep import substep_rule
 from pigjax.objects.overlay import legend_sheet, overlay
@@ -184,7 +184,7 @@ def _simulate(
         warnings.warn(f"{folder}: states of {len(missing)} frames are missing or damaged; made again.", stacklevel=2)
     report.modelled["integrator"] = rule.config.integrator
 
-    def todo() -> Iterator[Frame]:
+    def todo() -> Iterator[SimulatedFrame]:
         """Frames that are missing, from the start, then those after the checkpoint."""
         yield from run(particles, frames=range(repaired))
         if saved is None:

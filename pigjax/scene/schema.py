@@ -16,9 +16,11 @@ from pigjax.core.arguments import checked
 from pigjax.core.checks import LARGEST_WHOLE, Limits, joined, shown, suggest
 from pigjax.core.errors import InputError, MissingFileError, SceneError
 from pigjax.mpm.colliders import Box, Capsule, Collider, Cylinder, Plane, Sphere
+from pigjax.mpm.contact import broken_by
 from pigjax.mpm.materials import LAWS, PRESETS, Material, Parameters
 from pigjax.scene.accuracy import LEVELS, Accuracy, with_level
 from pigjax.scene.decode import Section, decode
+from pigjax.splatting.types import RenderConfig
 
 Triple = tuple[float, float, float]
 _NUMBERS = tuple(number.name for number in fields(Parameters))
@@ -118,7 +120,8 @@ class DrawingSpec(Section, frozen=True):
     # of the video's width and height: 0.5 draws a quarter of the pixels
     scale: Annotated[float, Limits(0, 16, above=True)] = 1.0
     sh_degree: Annotated[int, Limits(0, 3)] | None = None  # bands of view-dependent colour; None: all
-    alpha_min: Annotated[float, Limits(0, 1, below=True)] = 1 / 255  # fainter contributions are skipped
+    # fainter contributions are skipped; the bound is the opacity that no splat exceeds
+    alpha_min: Annotated[float, Limits(0, RenderConfig.alpha_max, below=True)] = 1 / 255
     transmittance_min: Annotated[float, Limits(0, 1, below=True)] = 1e-4  # a pixel is closed before it falls below
 
 
@@ -265,14 +268,25 @@ class Scene(Section, frozen=True):
     folder: str = "."  # set by `load_scene`; the base of relative paths
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
-        """Something moves, and each id belongs to one object."""
-        yield "objects", not all(spec.fixed for spec in self.objects.values()), "none moves; give one a material"
+        """Something moves, objects can be told apart, contact has its integrator, and pictures have a size."""
+        moving = sum(not spec.fixed for spec in self.objects.values())
+        yield "objects", moving > 0, "none moves; give one a material"
         owners: dict[int, str] = {}
         for name, spec in self.objects.items():
             if spec.id is not None:
                 owner = owners.setdefault(spec.id, name)
                 rule = f"{spec.id} is the id of objects.{joined(owner)}, too; each object has an id of its own"
                 yield joined("objects", name, "id"), owner == name, rule
+        has_views = self.input.views is not None
+        yield "input.views", has_views or len(self.objects) == 1, "several objects need photos with masks; give them"
+        yield "camera.view", has_views or self.camera.view is None, "photos have cameras; give input.views, or an orbit"
+        in_contact = moving > 1 and self.simulation.contact_friction is not None
+        broken = broken_by(self.simulation.integrator) if in_contact else None
+        yield "simulation.integrator", broken is None, f"{broken}, or remove simulation.contact_friction"
+        for name in ("width", "height"):
+            side = round(getattr(self.camera, name) * self.drawing.scale)
+            rule = f"camera.{name} times it {_PIXELS.broken(side)}, and is {side} px; lower one of the two"
+            yield "drawing.scale", side <= _PIXELS.high, rule
 
     def path(self, name: str) -> Path:
         """A path of the file, seen from the working directory."""
@@ -305,8 +319,9 @@ def load_scene(path: str | Path, *, accuracy: str | None = None) -> Scene:
 
     Raises:
         MissingFileError: there is no such file.
-        SceneError: it is not TOML, a field is unknown (the nearest right name is told), has the wrong type, or a value
-            is out of range.
+        SceneError: it is not TOML; a field is unknown (the nearest right name is told), is missing, has the wrong type
+            or a value out of range; fields contradict each other (`Section.rules`); or a material or a collider is
+            impossible.
     """
     path = Path(path)
     return scene_from(read_file(path, "scene file"), folder=path.parent, where=str(path), accuracy=accuracy)

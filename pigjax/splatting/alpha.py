@@ -5,8 +5,8 @@ second time, in plain form, as the oracle of the tests. Planes are [k p]: the k 
 tile, front to back.
 
 The transmittance T is the plain product of all (1 - alpha). It falls to `transmittance_min` or below at the splat that
-closes a pixel and stays there, and a splat is blended only if T is above that behind it. So a closed pixel stays closed
-without a flag.
+closes a pixel and stays there. A splat is blended only if T behind it is above `transmittance_min`. So a closed pixel
+stays closed without a flag.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, DTypeLike, Float, Int
 
 from pigjax.core.arrays import matmul
-from pigjax.splatting.binning import SHAPE_COLUMNS, BlendConfig
+from pigjax.splatting.binning import SHAPE_COLUMNS, BlendConfig, fall_off
 
 TERMS = 6  # of a polynomial of degree two in the plane: 1, x, y, xx, xy, yy
 _TRANSPARENT = np.array([-1e4, 0, 0, 0, 0, 0])  # polynomial of a splat whose alpha is 0
@@ -53,7 +53,7 @@ def tile_polynomials(rows: Float[Array, "s f"], tile: Int[Array, "s"], config: B
     half = config.tile / 2
     dx = (tile % config.columns * config.tile).astype(rows.dtype) + half - x
     dy = (tile // config.columns * config.tile).astype(rows.dtype) + half - y
-    at_centre = peak - (0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy)
+    at_centre = peak - fall_off(a, b, c, dx, dy)
     polynomial = jnp.stack([at_centre, -(a * dx + b * dy), -(b * dx + c * dy), -0.5 * a, -b, -0.5 * c], 1)
     return jnp.concatenate([polynomial, rows[:, SHAPE_COLUMNS:]], 1)
 
@@ -108,13 +108,16 @@ def sum_channels(
     return jnp.concatenate([matmul(values[:-1], blend.weight), picked])
 
 
+def may_be_surface(blend: Blend, config: BlendConfig) -> Bool[Array, "k p"]:
+    """Whether the pixel is open in front of a splat: the one that closes it is not blended, yet may be its surface."""
+    return blend.before > config.transmittance_min
+
+
 def crossing(
     alpha: Float[Array, "k p"], blend: Blend, tau: Float[Array, ""], config: BlendConfig
 ) -> Bool[Array, "k p"]:
     """Whether a splat takes the transmittance below tau, and so is the surface of the pixel (PIG, section 3.2)."""
-    # the splat that closes a pixel is not blended, yet it may be the surface
-    open_ = blend.before > config.transmittance_min
-    return open_ & (blend.before >= tau) & (blend.before * (1 - alpha) < tau)
+    return may_be_surface(blend, config) & (blend.before >= tau) & (blend.before * (1 - alpha) < tau)
 
 
 def running_sums(start: Float[Array, "p"], values: Float[Array, "k p"], config: BlendConfig) -> Float[Array, "k p"]:

@@ -2,8 +2,9 @@
 
 Splats are sorted by depth once (`bin_splats`). A pass (`list_pass`) takes the next of them, as many as its slots hold
 splat/tile pairs, leaves out tiles that are opaque already, and sorts the pairs by (tile, depth). Passes go on until
-every splat was taken or every tile is opaque. So nothing is dropped, memory does not grow with the number of pairs, and
-few hidden splats are listed. 3DGS lists all pairs at once (Kerbl et al. 2023, appendix C), which needs a capacity.
+every splat was taken, every tile is opaque, or the pairs of `RenderConfig.capacity` are used up; without a capacity,
+the default, nothing is dropped. Memory does not grow with the number of pairs, and few hidden splats are listed. 3DGS
+lists all pairs at once (Kerbl et al. 2023, appendix C), which needs a capacity.
 """
 
 from __future__ import annotations
@@ -243,6 +244,16 @@ def count_pairs(pairs: Int[Array, "n"]) -> Int[Array, ""]:
     return jnp.where(wraps, 2**31 - 1, jnp.sum(pairs, dtype=jnp.int32))
 
 
+def fall_off(
+    a: Float[Array, "s"], b: Float[Array, "s"], c: Float[Array, "s"], u: Float[Array, "s"], v: Float[Array, "s"]
+) -> Float[Array, "s"]:
+    """½ qᵀ Σ'⁻¹ q, by which the log of alpha falls from the centre of a splat to an offset q = (u, v) [px].
+
+    The conic Σ'⁻¹ has the entries a, b, c: xx, xy, yy [1/px²].
+    """
+    return 0.5 * (a * u * u + c * v * v) + b * u * v
+
+
 def _depth_order(projected: Projected, near: float) -> Int[Array, "n"]:
     """Stable order by depth, invisible splats last.
 
@@ -276,14 +287,11 @@ def _reaches(
     x0, y0 = left + 0.5 - x, top + 0.5 - y
     x1, y1 = x0 + (config.tile - 1), y0 + (config.tile - 1)
 
-    def power(u, v):
-        return 0.5 * (a * u * u + c * v * v) + b * u * v
-
     def along_y(u):
-        return power(u, jnp.clip(-b * u / c, y0, y1))
+        return fall_off(a, b, c, u, jnp.clip(-b * u / c, y0, y1))
 
     def along_x(v):
-        return power(jnp.clip(-b * v / a, x0, x1), v)
+        return fall_off(a, b, c, jnp.clip(-b * v / a, x0, x1), v)
 
     inside = (x0 <= 0) & (x1 >= 0) & (y0 <= 0) & (y1 >= 0)
     edge = jnp.minimum(jnp.minimum(along_y(x0), along_y(x1)), jnp.minimum(along_x(y0), along_x(y1)))

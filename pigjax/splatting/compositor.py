@@ -3,8 +3,8 @@
 Each pass of `binning.list_pass` is composited on top of the passes before it. A tile walks its list in chunks and stops
 when all its pixels are opaque. So time grows with the splat/tile pairs that are seen, and memory with splats, pixels
 and the slots of one pass, never with pixels x splats. The backward pass walks the same lists front to back: the sum of
-the splats behind one is the pixel's total, known from the forward pass, minus the running sum, so nothing is stored.
-The blending rule itself is in `alpha`.
+the splats behind one is the pixel's total, known from the forward pass, minus the running sum, so that no list per
+pixel is stored. The blending rule itself is in `alpha`.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from pigjax.splatting.scan_compositor import composite_by_scan
 from pigjax.splatting.sharding import shard_rows
 from pigjax.splatting.types import Projected
 
-State = tuple[Float[Array, "..."], ...]  # of a loop over lists: planes of each tile, the transmittance first
+LoopState = tuple[Float[Array, "..."], ...]  # of a loop over lists: planes of each tile, the transmittance first
 
 
 class Blended(NamedTuple):
@@ -93,8 +93,8 @@ def composite_tiles(
 ) -> tuple[Float[Array, "tiles c p"], Int[Array, ""]]:
     """Planes of each tile: features, alpha and, with `config.surface`, the surface depth.
 
-    Reverse mode costs about one more walk over the lists and stores the planes alone; there is no forward mode and no
-    second derivative (`composite_by_scan` has both).
+    Reverse mode costs about one more walk over the lists and stores the arguments and the planes; there is no forward
+    mode and no second derivative (`composite_by_scan` has both).
 
     Args:
         table: rows of `binning.rows_in_order`: shape columns, features, ones, and depths if the surface is wanted.
@@ -202,8 +202,8 @@ composite_tiles.defvjp(_composite_fwd, _composite_bwd)
 
 
 def _run_passes(
-    table: Float[Array, "n f"], boxes: Boxes, config: BlendConfig, state: State, visit: Callable
-) -> tuple[State, Int[Array, ""]]:
+    table: Float[Array, "n f"], boxes: Boxes, config: BlendConfig, state: LoopState, visit: Callable
+) -> tuple[LoopState, Int[Array, ""]]:
     """Run `visit(lists, state)` for one pass after the other; the state starts with the transmittance of each tile.
 
     Returns:
@@ -238,10 +238,10 @@ def _walk_lists(
     rows: Float[Array, "s f"],
     lists: TileLists,
     tiles: Int[Array, "b"],
-    state: State,
+    state: LoopState,
     visit: Callable,
     config: BlendConfig,
-) -> State:
+) -> LoopState:
     """Chunk after chunk of the lists of a group of tiles, until all lists end or all pixels are opaque.
 
     `visit(chunk, slot, valid, state)` gets the next rows of each tile [b k f], and the slot that each came from; the

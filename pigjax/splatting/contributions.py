@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int, Integer
 
 from pigjax.core.arrays import matmul
 from pigjax.core.camera import Camera
-from pigjax.splatting.alpha import Blend
+from pigjax.splatting.alpha import Blend, may_be_surface
 from pigjax.splatting.binning import BlendConfig, bin_splats, blend_config, into_tiles, rows_in_order, untile
 from pigjax.splatting.projection import project_splats
 from pigjax.splatting.scan_compositor import Chunks, all_chunks, scan_chunks
@@ -54,9 +54,7 @@ def soft_surface_depth(
         return jax.nn.sigmoid((tau_T - transmittance) / temperature)
 
     def shares(chunk: Chunks, alpha, blend: Blend):
-        # the splat that closes a pixel is not blended, yet it may be the surface
-        is_open = blend.before > config.transmittance_min
-        share = jnp.where(is_open, passed(blend.after) - passed(blend.before), 0.0)
+        share = jnp.where(may_be_surface(blend, blending), passed(blend.after) - passed(blend.before), 0.0)
         return jnp.stack([matmul(chunk.rows[:, _DEPTH], share), jnp.sum(share, 0)])
 
     parts = scan_chunks(chunks, jnp.any(chunks.valid, 1), blending, shares)

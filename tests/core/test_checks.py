@@ -166,6 +166,7 @@ def test_two_objects_whose_names_lead_to_one_id_are_refused(tmp_path):
     (tmp_path / "names.json").write_text('{"1": "duck"}')
     objects = {"duck": {"material": "jelly"}, "cube": {"id": 1, "material": "sand"}}
     values = {"input": {"gaussians": "cloud.ply", "names": "names.json"}, "simulation": {"dx": 0.1}, "objects": objects}
+    values["input"]["views"] = "photos"
     with pytest.raises(SceneError, match=r"objects\.cube: its id 1 is that of objects\.duck, too"):
         plan.read_inputs(scene_from(values, folder=tmp_path))
 

@@ -105,5 +105,5 @@ def test_bad_contacts_are_refused():
     particles, _ = two_blocks([(0, 0, 0), (0, 0, 0)], bodies=(0, 2))
     with pytest.raises(InputError, match=r"Particles.body = 2: BodyContact has bodies 0 to 1"):
         run(particles, BodyContact(bodies=2))
-    with pytest.raises(InputError, match=r"integrator = 'implicit' knows no contact between bodies"):
+    with pytest.raises(InputError, match=r"integrator = 'implicit': contact between bodies needs explicit steps"):
         run(particles, BodyContact(bodies=2), integrator="implicit")

@@ -25,6 +25,9 @@ from pigjax.scene import load_scene, plan, run_scene, scene_from
 from pigjax.segmentation import Labels
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "tabletop" / "scene.toml"
+SEEN = {"gaussians": "cloud.ply", "views": "photos"}
+TWO = {"ball": {"material": "jelly"}, "cube": {"material": "sand"}}
+CONTACT = {"dx": 0.05, "contact_friction": 0.3}
 BAD = {
     "unknown field": (values(simulation__frame=3), r"simulation\.frame: unknown field; did you mean 'frames'"),
     "unknown section": (values(simulatoin={}), r"simulatoin: unknown field; did you mean 'simulation'"),
@@ -83,6 +86,26 @@ BAD = {
         values(spheres__ball={"centre": [0, 0, 0], "radius": 1.0, "mode": "bounce"}),
         r"spheres\.ball\.mode = 'bounce': choose one of sticky, slip, separate",
     ),
+    "several objects without photos": (values(objects=TWO), r"input\.views: several objects need photos with masks"),
+    "view without photos": (
+        values(camera={"view": "left"}),
+        r"camera\.view = 'left': photos have cameras; give input\.views",
+    ),
+    **{
+        f"contact in {integrator} steps": (
+            values(input=SEEN, objects=TWO, simulation={**CONTACT, "integrator": integrator}),
+            rf"simulation\.integrator = '{integrator}': contact between bodies needs explicit steps.*contact_friction",
+        )
+        for integrator in ("implicit", "auto")
+    },
+    "alpha that no splat reaches": (
+        values(drawing={"alpha_min": 0.99}),
+        r"drawing\.alpha_min = 0\.99: it must be < 0\.99",
+    ),
+    "too many pixels": (
+        values(camera={"height": 2000}, drawing={"scale": 16}),
+        r"drawing\.scale = 16\.0: camera\.height times it must be 16384 px or less, and is 32000 px",
+    ),
 }
 
 
@@ -92,6 +115,18 @@ def test_bad_scene_is_one_clear_line(case):
     with pytest.raises(SceneError, match=message) as caught:
         scene_from(content)
     assert "\n" not in str(caught.value)
+
+
+def test_contact_is_accepted_in_explicit_steps_and_where_one_object_moves():
+    scene_from(values(input=SEEN, objects=TWO, simulation=CONTACT))
+    scene_from(values(simulation={**CONTACT, "integrator": "implicit"}))
+
+
+def test_a_view_that_no_photo_has_is_refused_with_the_inputs():
+    scene = load_scene(EXAMPLE)
+    lost = msgspec.structs.replace(scene, camera=msgspec.structs.replace(scene.camera, view="no photo"))
+    with pytest.raises(SceneError, match=r"camera\.view = 'no photo': choose one of"):
+        plan.read_inputs(lost)
 
 
 def test_missing_and_torn_files_are_clear_errors(tmp_path):

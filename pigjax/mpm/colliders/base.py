@@ -1,7 +1,8 @@
 """The base of all colliders: pose and motion, contact by mode, and checks of their numbers.
 
-In explicit steps contact projects node velocities (`Collider.apply`), at once or over the width `softness`. In implicit
-steps colliders are compliant (penalty) constraints, as stiff as the matter (`implicit.newton`).
+In explicit steps contact is a projection of node velocities (`Collider.apply`), at once or over the width `softness`;
+it has no penalty force. Implicit steps have penalty contact: a compliant constraint as stiff as the matter
+(`implicit.newton`).
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ class Collider(eqx.Module):
 
     Whether a point is inside is a hard test, which has no derivative: a rollout can be differentiated by friction, by
     velocities and, through the normals, by the pose, but a plane shifted along its normal has no effect until it
-    passes a node. With a `softness`, contact sets in smoothly over that width, and so all of the pose counts.
+    passes a node. With a `softness`, contact sets in smoothly over that width, and so all of the pose counts: it
+    weights the projection of velocities, and is no penalty force.
 
     Raises:
         InputError: the mode is unknown, or a number is not finite or out of range; the message starts with the field.

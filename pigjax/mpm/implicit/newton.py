@@ -1,10 +1,11 @@
 """Backward Euler on the grid: node velocities in balance with the stresses at the end of the step, by Newton's method.
 
 Each Newton step is a Krylov solve with the derivatives of the forces (Gast et al. 2015, doi 10.1109/TVCG.2015.2459687).
-Colliders are compliant (penalty) constraints, as stiff as the matter: the problem is convex, where hard contact would
-make Newton's method jump between sets of touched nodes. The first solve has no friction and gives the normal pressure;
-a second one adds friction of that pressure (lagged, as by Li et al. 2020, doi 10.1145/3386569.3392425), so that stiff
-matter shares its impulse within the step. Derivatives follow the implicit function theorem.
+Colliders act by penalty contact: they are compliant constraints, as stiff as the matter. So the problem is convex;
+hard contact would make Newton's method jump between sets of touched nodes. The first solve has no friction and gives
+the normal pressure; a second one adds friction of that pressure (lagged, as by Li et al. 2020, doi
+10.1145/3386569.3392425), so that stiff matter shares its impulse within the step. Derivatives follow the implicit
+function theorem.
 """
 
 from __future__ import annotations
@@ -229,7 +230,7 @@ def _modes(step: _Step) -> Modes:
 def _pressing(smooth: StepContext, v: Nodes, time: Time) -> list[Float[Array, "x y z 1"]]:
     """Speeds [m/s] at which nodes press against each collider, one after another."""
     found = []
-    for collider, contact in zip(smooth.colliders, smooth.contacts):
+    for collider, contact in zip(smooth.colliders, smooth.collider_contacts):
         contact = collider.contact(smooth.grid.points, time) if contact is None else contact
         held = collider.apply(contact, v)
         found.append(((held - v) * contact.normal).sum(-1, keepdims=True))

@@ -75,8 +75,8 @@ def fit(
         has_aux: see `loss`.
         checkpoint: file from which a killed search resumes, bit for bit; it does not keep the scores of `has_aux`.
         every: steps between checkpoints.
-        mark: what the loss depends on beside its code, what it closes over and `shared`, as a mapping by name or any
-            value: files that it reads, for example.
+        mark: further inputs of the loss, beside its code, its closed-over values and `shared`: files that it reads, for
+            example. A mapping by name, or any value.
         overwrite: start over where the checkpoint belongs to another search, instead of refusing it.
 
     Returns:

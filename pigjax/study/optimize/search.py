@@ -51,8 +51,8 @@ def search(
         shared: as in `fit`.
         spread: standard deviation of the first candidates, in the unconstrained numbers behind the bounds.
         population: candidates of a generation; None: 4 + 3 ln(numbers sought).
-        vectorize: False calls the loss candidate by candidate outside of jit; what it raises for bad input or a broken
-            simulation counts as not finite.
+        vectorize: False calls the loss candidate by candidate outside of jit; a loss that raises for bad input or a
+            broken simulation counts as not finite.
         seed: of the candidates.
         checkpoint: file from which a killed search resumes, bit for bit: it holds the losses, by which the generations
             so far are drawn again.

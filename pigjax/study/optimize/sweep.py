@@ -60,11 +60,11 @@ def sweep(
         resume: folder where finished batches are kept, so that a killed sweep resumes.
         shared: inputs of all rows, a pytree of arrays. Arrays that `fn` closes over are compiled into the program.
         check: raises InputError for parameters that cannot be (host).
-        vectorize: False calls `fn` row after row outside of jit, for functions that no one can trace; what they raise
-            for bad input or a broken simulation marks the row.
+        vectorize: False calls `fn` row after row outside of jit, for functions that cannot be traced; an exception for
+            bad input or a broken simulation marks the row.
         callback: called with rows done and rows to do after each batch.
-        mark: what the results depend on beside `fn` (its code and what it closes over), the parameters and `shared`,
-            as a mapping by name or any value: files that `fn` reads, for example.
+        mark: further inputs of the results, beside `fn` (its code and closed-over values), the parameters and `shared`:
+            files that `fn` reads, for example. A mapping by name, or any value.
         overwrite: replace rows in `resume` that were made from something else, instead of refusing them.
 
     Raises:
