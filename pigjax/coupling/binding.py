@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from pigjax.clamp import ClampParams, clamped_shapes
 from pigjax.core.arguments import checked
 from pigjax.core.arrays import array_field, einsum, in_precision, real_field
+from pigjax.core.checks import check_axes
 from pigjax.core.errors import InputError
 from pigjax.coupling.seeding import object_ids
 from pigjax.mpm import Particles, Trajectory
@@ -91,8 +92,9 @@ def deform(
         binding: carriers of the Gaussians without a particle; without it they stay at rest.
 
     Raises:
-        InputError: unknown mode.
+        InputError: unknown mode, or positions and deformations of another number of particles.
     """
+    check_axes(particles)
     # no Gaussian has two particles, so the moving ones are at most as many as either
     (row,) = jnp.nonzero(particles.gaussian >= 0, size=min(len(gaussians), len(particles)), fill_value=len(particles))
     index = particles.gaussian.at[row].get(mode="fill", fill_value=len(gaussians))
@@ -129,13 +131,16 @@ def at_frame(particles: Particles, trajectory: Trajectory, frame: int | Int[Arra
         frame: number of the frame, from 0; negative numbers count from the end.
 
     Raises:
-        InputError: the trajectory has no such frame (a traced frame is not checked; JAX would take the last one).
+        InputError: the trajectory is of other particles, or has no such frame (a traced frame is not checked; JAX would
+            take the last one).
     """
     frames = trajectory.x.shape[0]
     if isinstance(frame, int | np.integer) and not -frames <= frame < frames:
         raise InputError(f"frame = {frame}: the trajectory has frames 0 to {frames - 1}.")
-    return eqx.tree_at(
+    moved = eqx.tree_at(
         lambda p: (p.x, p.v, p.F_visual),
         particles,
         (trajectory.x[frame], trajectory.v[frame], trajectory.F_visual[frame]),
     )
+    check_axes(moved)
+    return moved

@@ -151,6 +151,11 @@ ROWS = {
     "big id": ("objects.duck.id", 2**31, r"objects\.duck\.id = 2147483648: it must be 2147483647 or less"),
     "weight": ("clamp.lambda_R", math.nan, r"clamp\.lambda_R = nan: it must be finite"),
     "radius": ("camera.radius", 0, r"camera\.radius = 0\.0: it must be > 0 m"),
+    "radius below": ("camera.radius", -1, r"camera\.radius = -1\.0: it must be > 0 m"),
+    "seed": ("simulation.seed", -1, r"simulation\.seed = -1: it must be 0 or more"),
+    "size": ("input.max_size", 0, r"input\.max_size = 0: it must be 1 px or more"),
+    "gravity": ("simulation.gravity", math.nan, r"simulation\.gravity = nan: it must be finite"),
+    "background": ("camera.background", math.nan, r"camera\.background = nan: it must be finite"),
 }
 
 

@@ -282,3 +282,13 @@ def test_only_what_moves_is_written(seeded):
     np.testing.assert_array_equal(posed.factors[still], rest.factors[still])
     np.testing.assert_array_equal(posed.sh_rotations[still], np.broadcast_to(np.eye(3), (len(still), 3, 3)))
     assert (np.asarray(posed.means) != np.asarray(rest.means)).any(1).sum() == len(gaussians) - len(still)
+
+
+def test_states_of_other_particles_are_refused(seeded):
+    gaussians, _, particles, _ = seeded
+    fewer = Trajectory(*(a[None, 5:] for a in (particles.x, particles.v, particles.F_visual)))
+    with pytest.raises(InputError, match=rf"Particles\.v holds {len(particles)}|Particles\.F holds {len(particles)}"):
+        at_frame(particles, fewer, 0)
+    short = eqx.tree_at(lambda p: (p.x, p.F_visual), particles, (particles.x[5:], particles.F_visual[5:]))
+    with pytest.raises(InputError, match=rf"Particles\.x holds {len(particles) - 5}"):
+        deform(gaussians, short, ClampParams())

@@ -248,6 +248,7 @@ WRITERS = {
     "table.csv": lambda path: table_of("a", [1.0]).save(path),
     "labels.npz": lambda path: io.save_labels(path, np.zeros(2, np.int32), np.zeros((2, 3)), np.zeros(2)),
     "history.npz": lambda path: history().save(path),
+    "last.ckpt": lambda path: io.save_pytree(path, (np.zeros(3), np.ones(2)), parts={"format": "1"}),
 }
 DRAWERS = {
     "curve.png": lambda path: table_of("a", [1.0, 2.0]).curve(path, "a", "loss"),

@@ -137,6 +137,22 @@ def test_the_walls_of_a_small_grid_bound_a_fall_and_its_substeps():
     assert rule.first == choose_substeps(cube(), small, TABLE, rule.config, **steps)
 
 
+@pytest.mark.parametrize("only", ["inverted", "unconverged"])
+def test_a_simulation_stops_at_matter_that_is_only_inverted_or_steps_that_only_did_not_converge(only):
+    """One Newton step of one product is too few for squeezed matter; matter turned inside out stays so."""
+    start = cube(velocity=jnp.asarray([0.0, 0.0, -0.5]))
+    config = SimConfig(substeps=1, stop=True, integrator="implicit", newton_steps=1, krylov_steps=1)
+    start = replace(start, F=start.F.at[..., 0, 0].set(0.8))
+    if only == "inverted":
+        start = replace(start, F=start.F.at[..., 0, 0].set(-1.0))
+        config = SimConfig(substeps=1, stop=True, force=True)
+    grid, steps = fit_grid(start.x, DX, margin=2 * DX), {"frames": 3, "frame_dt": 1e-3, "gravity": (0.0, 0.0, -9.8)}
+    _, path, health = rollout(start, grid, TABLE, config, **steps)
+    assert [name for name in COUNTS if int(getattr(health, name)) > 0] == [only]
+    assert int(health.first_bad_frame) == 0
+    np.testing.assert_array_equal(path.x[1:], np.broadcast_to(path.x[0], path.x[1:].shape))
+
+
 def test_a_step_decides_its_integrator_or_says_that_it_cannot():
     grid, config = fit_grid(CUBE, DX, margin=0.3), SimConfig(integrator="auto")
     limit = float(stable_dt(TABLE, grid, max_speed=0.0))
