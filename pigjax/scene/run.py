@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -114,9 +114,9 @@ def _mark(scene: Scene, inputs: Inputs) -> str | None:
 
 def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: RunReport) -> None:
     names = {number: name for name, number in inputs.ids.items()}
-    object_id, counts = np.asarray(labels.object_id), plan.particles.counts
-    of_object = dict(zip((name for name, entry in scene.objects.items() if not entry.fixed), counts))
-    of_law = {law: sum(n for n, own in zip(counts, plan.table.laws) if own == law) for law in plan.table.laws}
+    object_id = np.asarray(labels.object_id)
+    moving = [name for name, entry in scene.objects.items() if not entry.fixed]
+    of_object, of_law = _particles_of(moving, plan.particles.counts, plan.table.laws)
     report.modelled |= {
         "accuracy": scene.accuracy,
         "laws": sorted(set(plan.table.laws)),
@@ -137,6 +137,16 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
         "frames": scene.simulation.frames,
         "mass_kg": float(plan.particles.mass.sum()),
     }
+
+
+def _particles_of(
+    objects: Sequence[str], counts: Sequence[int], laws: Sequence[str]
+) -> tuple[dict[str, int], dict[str, int]]:
+    """Particles of each object, and of each law, which several objects may share; rows of the table in their order."""
+    of_law = dict.fromkeys(laws, 0)
+    for count, law in zip(counts, laws):
+        of_law[law] += count
+    return dict(zip(objects, counts)), of_law
 
 
 def _simulate(

@@ -1,8 +1,10 @@
 """The one command of all benchmarks, its pages and its timer."""
 
+import sys
 import time
 from types import SimpleNamespace
 
+import jax
 import pytest
 
 from benchmarks.common import command
@@ -110,3 +112,14 @@ def test_no_benchmark_patches_the_library():
         path for path in command.HERE.rglob("*.py") if "mock" in path.read_text() or "setattr(" in path.read_text()
     ]
     assert not files
+
+
+def test_a_reconstruction_is_shared_by_the_devices_that_there_are(monkeypatch):
+    """And by no others: a machine with one accelerator and 16 cores has one."""
+    module, asked = command.load("reconstruct"), []
+    monkeypatch.setattr(module, "reconstruct", lambda views, config, **_: asked.append(config) or sys.exit())
+    for given in ([], ["--devices", "1"]):
+        options = command.parser_of("reconstruct", module).parse_args(given)
+        with pytest.raises(SystemExit):
+            module.train(options)
+    assert [config.render.bands for config in asked] == [jax.local_device_count()] * 2

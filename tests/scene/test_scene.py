@@ -21,7 +21,10 @@ from typer.testing import CliRunner
 from pigjax import io
 from pigjax.cli import app, segmenting
 from pigjax.core.errors import InputError, MissingFileError, SceneError, SimulationError
+from pigjax.mls_mpm import rollout
+from pigjax.mpm import vast_grid
 from pigjax.scene import load_scene, plan, run_scene, scene_from
+from pigjax.scene import run as run_module
 from pigjax.segmentation import Labels
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "tabletop" / "scene.toml"
@@ -326,3 +329,35 @@ def test_bad_input_is_exit_code_2_and_one_line(tmp_path):
     assert "no.ply" in run.stderr
     assert len(run.stderr.strip().splitlines()) == 1
     assert "Traceback" not in run.stderr
+
+
+def test_two_objects_of_one_law_are_counted_apart():
+    of_object, of_law = run_module._particles_of(["duck", "cube", "ball"], (3, 2, 4), ("jelly", "jelly", "sand"))
+    assert of_object == {"duck": 3, "cube": 2, "ball": 4}
+    assert of_law == {"jelly": 5, "sand": 4}
+
+
+@pytest.mark.slow
+def test_a_fall_of_twenty_metres_takes_the_substeps_of_a_rollout_and_lands(tmp_path):
+    """In a domain without walls the speed of each frame counts, and not the size of the grid at the start."""
+    x = np.random.default_rng(0).uniform(-0.2, 0.2, (60, 3)) + np.array([0, 0, 20.3])
+    shape = np.full((60, 3), np.log(0.05)), np.tile([1.0, 0, 0, 0], (60, 1)), np.full(60, 4.0), np.full((60, 1, 3), 0.5)
+    io.save_ply(tmp_path / "cloud.ply", Gaussians(*(jnp.asarray(v, jnp.float32) for v in (x, *shape))))
+    scene = scene_from({
+        "input": {"gaussians": "cloud.ply"},
+        "simulation": {"dx": 0.2, "frames": 56, "fps": 24.0, "fill": False, "particles_per_cell": 2},
+        "objects": {"a": {"id": 1, "material": "jelly"}},
+        "planes": {"floor": {"point": [0, 0, 0], "normal": [0, 0, 1]}},
+        "camera": {"width": 16, "height": 16},
+    }, folder=tmp_path)  # fmt: skip
+    report = run_scene(scene, tmp_path / "out")
+    heights = [float(io.load_state(tmp_path / "out/states", frame)["x"][:, 2].mean()) for frame in (24, 56)]
+    assert heights[0] == pytest.approx(20.3 - 9.81 / 2, abs=0.2)
+    assert heights[1] < 0.5
+    inputs = plan.read_inputs(scene)
+    made = plan.make_plan(scene, inputs, plan.segment(scene, inputs))
+    _, _, health = rollout(
+        made.particles, vast_grid(0.2), made.table, made.config, frames=56, frame_dt=made.frame_dt,
+        gravity=jnp.asarray(made.gravity, jnp.float32), colliders=made.colliders,
+    )  # fmt: skip
+    assert report.sizes["substeps_per_frame"] == int(health.substeps)
