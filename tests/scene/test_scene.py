@@ -26,6 +26,7 @@ from pigjax.mpm import vast_grid
 from pigjax.scene import load_scene, plan, run_scene, scene_from
 from pigjax.scene import run as run_module
 from pigjax.segmentation import Labels
+from pigjax.splat import Gaussians
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "tabletop" / "scene.toml"
 SEEN = {"gaussians": "cloud.ply", "views": "photos"}
