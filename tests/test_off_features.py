@@ -163,8 +163,8 @@ def test_colliders_at_rest_are_found_once_and_moving_ones_in_each_step(plain):
     assert sizes == sorted(set(sizes))
     nodes = [step["iota"] for step in steps]  # whose places a moving collider is asked about
     assert nodes[0] == nodes[1] < nodes[2]
-    assert primitives(turning)["sin"] > 0
-    assert primitives(moving)["sin"] == primitives(plain)["sin"] == 0
+    assert primitives(turning)["cos"] > 0
+    assert primitives(moving)["cos"] == primitives(plain)["cos"] == 0
 
 
 def test_matter_carries_only_the_state_that_its_law_has():
