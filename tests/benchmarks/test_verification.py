@@ -95,6 +95,7 @@ def test_two_discs_with_body_contact_part_without_a_pull():
     assert 0.65 < moving[-1] + stored[-1] <= 1
 
 
+@pytest.mark.slow
 def test_dam_break_front_runs_as_in_the_experiment():
     """Martin and Moyce 1952: the speed beyond Z = 2 within 1 %; the front itself is 9 % ahead, their gate's delay."""
     T, Z, _ = front(12)

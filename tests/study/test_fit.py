@@ -245,6 +245,7 @@ def test_clamp_weights_and_bounds_are_recovered_from_posed_factors():
     np.testing.assert_allclose([best["lambda_R"], best["lambda_S"], best["tau_max"]], [0.7, 0.5, 1.6], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_stiffness_speed_and_a_colliders_place_are_recovered_from_a_path():
     table = pj.material_table([pj.Material(model="fixed_corotated", density=1000.0, young=1e4, poisson=0.3)])
     at = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), -1).reshape(-1, 3) * 0.05 + 0.4
