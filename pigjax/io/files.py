@@ -325,7 +325,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def reason_of(error: BaseException) -> str:
-    """What a decoder's error means for the file, in one line and without what concerns only Python."""
+    """Cause of a decoder's error in terms of the file, in one line, without Python's own advice."""
     said = (str(error).strip().splitlines() or [""])[0]
     if isinstance(error, UnicodeDecodeError):
         return f"byte {error.start} is not {error.encoding.upper()}"

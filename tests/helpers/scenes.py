@@ -1,9 +1,19 @@
-"""A ball of splats and the scene file that drops it."""
+"""A ball of splats and the scene files that drop and throw it."""
 
 import jax.numpy as jnp
 import numpy as np
+import tomli_w
 
+from pigjax import io
 from pigjax.splat import Gaussians
+
+THROW = {
+    "input": {"gaussians": "cloud.ply"},
+    "simulation": {"dx": 0.08, "frames": 3, "fps": 30.0, "particles_per_cell": 4},
+    "objects": {"ball": {"id": 1, "material": "jelly", "young": 4000.0, "velocity": [0.5, 0.0, -1.0]}},
+    "planes": {"floor": {"point": [0, 0, 0.04], "normal": [0, 0, 1], "friction": 0.3}},
+    "camera": {"width": 24, "height": 20, "target": [0, 0, 0.3], "radius": 2.0},
+}
 
 
 def values(**changes):
@@ -30,3 +40,10 @@ def ball(count=400, seed=0):
     sh = rng.uniform(-1, 1, (count, 1, 3))
     parts = points, np.full((count, 3), np.log(0.02)), quats, np.full(count, 3.0), sh
     return Gaussians(*(jnp.asarray(v, jnp.float32) for v in parts))
+
+
+def write_throw(folder):
+    """The thrown ball's cloud and scene file; the folder."""
+    io.save_ply(folder / "cloud.ply", ball(150))
+    (folder / "scene.toml").write_text(tomli_w.dumps(THROW))
+    return folder

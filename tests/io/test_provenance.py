@@ -207,7 +207,7 @@ def test_a_killed_search_goes_on_as_if_unbroken_whatever_else_draws_numbers(tmp_
 
     with pytest.raises(Killed):
         seek(tmp_path / "b", evaluations=30, callback=kill)
-    np.random.seed(0)  # noqa: NPY002 - the state that all of NumPy shares is what must not matter
+    np.random.seed(0)  # noqa: NPY002 - cma may draw from NumPy's global state: changed here, it must not change the resumed search
     broken, resumed = seek(tmp_path / "b", evaluations=30)
     np.testing.assert_array_equal(whole["x"], broken["x"])
     np.testing.assert_array_equal(history.loss, resumed.loss)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import tomli_w
 from conftest import ACCEPTED
-from scenes import ball
+from scenes import THROW, ball, write_throw
 from typer.testing import CliRunner
 from walls import FAR, NEAR, write_folder
 from walls import scene as walls
@@ -27,14 +27,6 @@ from pigjax.mpm import StepHealth, Trajectory
 from pigjax.scene import run as run_module
 from pigjax.scene import run_scene, scene_from
 from pigjax.study import load_study, sweep_study, tune_study
-
-SCENE = {
-    "input": {"gaussians": "cloud.ply"},
-    "simulation": {"dx": 0.08, "frames": 3, "fps": 30.0, "particles_per_cell": 4},
-    "objects": {"ball": {"id": 1, "material": "jelly", "young": 4000.0, "velocity": [0.5, 0.0, -1.0]}},
-    "planes": {"floor": {"point": [0, 0, 0.04], "normal": [0, 0, 1], "friction": 0.3}},
-    "camera": {"width": 24, "height": 20, "target": [0, 0, 0.3], "radius": 2.0},
-}
 
 
 class Reached(Exception):
@@ -51,16 +43,13 @@ def reached(monkeypatch):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("scene")
-    io.save_ply(path / "cloud.ply", ball(150))
-    (path / "scene.toml").write_text(tomli_w.dumps(SCENE))
-    return path
+    return write_throw(tmp_path_factory.mktemp("scene"))
 
 
 @pytest.fixture(scope="module")
 def finished(folder, tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
-    run_scene(scene_from(SCENE, folder=folder), out)
+    run_scene(scene_from(THROW, folder=folder), out)
     return out
 
 
@@ -118,7 +107,7 @@ def test_a_run_names_the_input_that_changed(tmp_path, reached, edit, named):
     root, out = tmp_path / "a", tmp_path / "out"
     write_folder(root, "views")
     given = {"gaussians": "scene.ply", "views": "transforms.json", "names": "names.json"}
-    values = {**SCENE, "input": given, "objects": {"near": {"material": "jelly"}, "far": {"fixed": True}}}
+    values = {**THROW, "input": given, "objects": {"near": {"material": "jelly"}, "far": {"fixed": True}}}
     reached(run_module, "segment")
     with pytest.raises(Reached):
         run_scene(scene_from(values, folder=root), out)
@@ -137,8 +126,8 @@ def test_a_run_names_the_input_that_changed(tmp_path, reached, edit, named):
 
 @pytest.mark.parametrize("name", ["dx", "fps", "frames", "seed", "gravity"])
 def test_a_run_names_the_setting_that_changed(folder, finished, name):
-    present = SCENE["simulation"].get(name, 0)
-    changed = {**SCENE, "simulation": {**SCENE["simulation"], name: present + 1}}
+    present = THROW["simulation"].get(name, 0)
+    changed = {**THROW, "simulation": {**THROW["simulation"], name: present + 1}}
     before = (finished / "report.json").read_bytes()
     with pytest.raises(StaleError, match=rf"simulation\.{name} \(.* -> {present + 1}"):
         run_scene(scene_from(changed, folder=folder), finished)
@@ -149,7 +138,7 @@ def test_a_run_names_the_setting_that_changed(folder, finished, name):
                                      {"drawing": {"scale": 0.5}}])  # fmt: skip
 def test_what_is_only_drawn_simulates_nothing(folder, finished, reached, section, monkeypatch):
     ((name, values),) = section.items()
-    scene = scene_from({**SCENE, name: {**SCENE.get(name, {}), **values}}, folder=folder)
+    scene = scene_from({**THROW, name: {**THROW.get(name, {}), **values}}, folder=folder)
     monkeypatch.setattr(run_module.ActiveGrid, "frame", None)
     reached(run_module, "_draw")
     with pytest.raises(Reached):
@@ -187,7 +176,7 @@ def test_damaged_runs_end_with_the_same_bits(folder, finished, tmp_path, monkeyp
     shutil.copytree(finished, out)
     DAMAGES[case](out / "states")
     monkeypatch.setattr(run_module, "_draw", lambda *_: None)
-    report = run_scene(scene_from(SCENE, folder=folder), out)
+    report = run_scene(scene_from(THROW, folder=folder), out)
     assert_same_states(out, finished)
     assert case in SILENT or json.loads((out / "report.json").read_text())["warnings"], report.warnings
 
@@ -208,14 +197,14 @@ run_scene(load_scene(Path(sys.argv[1]) / "scene.toml"), sys.argv[2], progress=te
     done = subprocess.run(command, capture_output=True, env=same_code)
     assert done.returncode == -signal.SIGKILL, done.stderr
     monkeypatch.setattr(run_module, "_draw", lambda *_: None)
-    run_scene(scene_from(SCENE, folder=folder), tmp_path)
+    run_scene(scene_from(THROW, folder=folder), tmp_path)
     assert_same_states(tmp_path, finished)
 
 
 def test_the_command_refuses_a_stale_folder_in_one_line_and_replaces_it_on_request(folder, finished, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(finished, out)
-    changed = {**SCENE, "simulation": {**SCENE["simulation"], "frames": 1}, "input": {"gaussians": "../cloud.ply"}}
+    changed = {**THROW, "simulation": {**THROW["simulation"], "frames": 1}, "input": {"gaussians": "../cloud.ply"}}
     (folder / "other").mkdir()
     (folder / "other" / "scene.toml").write_text(tomli_w.dumps(changed))
     code = "import sys; sys.argv[0] = 'pigjax'; from pigjax.cli import main; main()"

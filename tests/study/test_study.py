@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 import tomli_w
-from scenes import ball
+from scenes import THROW, ball, write_throw
 from typer.testing import CliRunner
 
 from pigjax import io
@@ -28,21 +28,11 @@ from pigjax.study.objectives import pyramid_error, video
 from pigjax.study.optimize import load_table
 
 STUDIES = Path(__file__).parents[2] / "examples" / "studies"
-SCENE = {
-    "input": {"gaussians": "cloud.ply"},
-    "simulation": {"dx": 0.08, "frames": 3, "fps": 30.0, "particles_per_cell": 4},
-    "objects": {"ball": {"id": 1, "material": "jelly", "young": 4000.0, "velocity": [0.5, 0.0, -1.0]}},
-    "planes": {"floor": {"point": [0, 0, 0.04], "normal": [0, 0, 1], "friction": 0.3}},
-    "camera": {"width": 24, "height": 20, "target": [0, 0, 0.3], "radius": 2.0},
-}
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("study")
-    io.save_ply(path / "cloud.ply", ball(150))
-    (path / "scene.toml").write_text(tomli_w.dumps(SCENE))
-    return path
+    return write_throw(tmp_path_factory.mktemp("study"))
 
 
 @pytest.fixture(scope="module")
@@ -109,10 +99,10 @@ def test_density_makes_mass_and_gravity_points_down(made):
 
 
 def test_the_scenes_drawing_settings_are_kept(folder):
-    drawn = scene_from({**SCENE, "drawing": {"alpha_min": 0.02, "scale": 0.5}}, folder=folder)
+    drawn = scene_from({**THROW, "drawing": {"alpha_min": 0.02, "scale": 0.5}}, folder=folder)
     made = experiment(drawn)
     assert made.render.alpha_min == 0.02
-    assert made.cameras.width == SCENE["camera"]["width"] // 2
+    assert made.cameras.width == THROW["camera"]["width"] // 2
 
 
 def test_unknown_names_are_told_with_the_nearest_right_one(made):
@@ -194,7 +184,7 @@ def test_a_sweep_of_the_clamp_simulates_once(folder, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_tuning_finds_the_throw_that_hits(folder, tmp_path):
     # without contact the middle flies a parabola: x = x0 + v t, z = z0 + v t - g t² / 2
-    scene = {**SCENE, "planes": {}}
+    scene = {**THROW, "planes": {}}
     (folder / "flight.toml").write_text(tomli_w.dumps(scene))
     path = study_file(
         folder,
