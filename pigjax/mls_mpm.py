@@ -43,6 +43,7 @@ from jaxtyping import Array, Float
 from pigjax.core.arguments import checked
 from pigjax.core.arrays import is_known
 from pigjax.core.errors import InputError
+from pigjax.core.regions import Region
 from pigjax.mpm import Grid, Health, Particles, SimConfig, StepHealth, Trajectory
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact, broken_by
@@ -81,6 +82,7 @@ def step(
     gravity: Vector,
     colliders: tuple[Collider, ...] = (),
     contact: BodyContact | None = None,
+    pins: tuple[Region, ...] = (),
 ) -> tuple[Particles, StepHealth]:
     """One step: particles to grid (P2G), grid update, grid to particles (G2P).
 
@@ -96,6 +98,7 @@ def step(
         gravity: [m/s²].
         colliders: as they are at the beginning of the step.
         contact: between the bodies of `Particles.body`; None, the default: they share one velocity field.
+        pins: regions in which matter does not move.
 
     Returns:
         Particles in the same order, and the health of the step.
@@ -109,7 +112,7 @@ def step(
     check_gravity(gravity)
     if is_known(dt) and not 0 <= float(dt) < math.inf:
         raise InputError(f"dt = {float(dt)}: a step must be >= 0 s, and finite.")
-    if is_known(particles, grid, table, dt, gravity, colliders, contact):
+    if is_known(particles, grid, table, dt, gravity, colliders, contact, pins):
         if config.integrator == "auto":
             explicit = replace(config, integrator="explicit")
             is_stable = float(dt) <= longest_step(float(dt), particles, grid, table, explicit, colliders)[0]
@@ -117,7 +120,7 @@ def step(
         check_dt(float(dt), particles, grid, table, config, colliders)
     elif config.integrator == "auto":
         raise InputError(f"step {_UNDECIDED}")
-    end, _, health = _compiled(particles, grid, table, config, dt, gravity, colliders, contact, 1, 1)
+    end, _, health = _compiled(particles, grid, table, config, dt, gravity, colliders, contact, pins, 1, 1)
     return end, health
 
 
@@ -134,6 +137,7 @@ def rollout(
     colliders: tuple[Collider, ...] = (),
     contact: BodyContact | None = None,
     sleep: Sleep | None = None,
+    pins: tuple[Region, ...] = (),
 ) -> tuple[Particles, Trajectory, Health]:
     """Simulate frames of substeps.
 
@@ -156,6 +160,8 @@ def rollout(
         contact: between the bodies of `Particles.body`; None, the default: they share one velocity field.
         sleep: when bodies at rest are left out until another one comes near; None, the default: never. Outside of jit,
             grad and vmap only, since it is decided between frames.
+        pins: regions in which matter does not move, as where a plant stands in its pot: grid nodes in them have no
+            velocity. Which nodes these are has no derivative; all else keeps its own.
 
     Returns:
         Particles after the last frame, the path with one entry for each frame, and the worst health of all steps.
@@ -168,7 +174,7 @@ def rollout(
     _check_table(particles, table)
     _check_contact(particles, config, contact)
     check_steps(frames, frame_dt, gravity)
-    shared = (particles, grid, table, frame_dt, gravity, colliders, contact)
+    shared = (particles, grid, table, frame_dt, gravity, colliders, contact, pins)
     if not is_known(shared):
         if sleep is not None:
             raise InputError(
@@ -182,15 +188,15 @@ def rollout(
         if config.integrator == "auto":
             raise InputError(f"rollout {_UNDECIDED}")
         dt = jnp.asarray(frame_dt) / config.substeps
-        return _compiled(particles, grid, table, config, dt, gravity, colliders, contact, frames, config.substeps)
+        return _compiled(particles, grid, table, config, dt, gravity, colliders, contact, pins, frames, config.substeps)
     rule = substep_rule(
         particles, grid, table, config, frames=frames, frame_dt=frame_dt, gravity=gravity, colliders=colliders
     )
     check_dt(float(frame_dt) / rule.first, particles, grid, table, rule.config, colliders)
-    numbers = (frame_dt, jnp.asarray(gravity), grid, table, colliders, contact)
-    duration, down, grid, table, colliders, contact = _like(numbers, particles)
+    numbers = (frame_dt, jnp.asarray(gravity), grid, table, colliders, contact, pins)
+    duration, down, grid, table, colliders, contact, pins = _like(numbers, particles)
     if sleep is None and not rule.adaptive and math.prod(grid.shape) <= _SMALL:
-        inputs = StepInputs(duration / rule.first, rule.first, down, jnp.zeros_like(duration), colliders, contact)
+        inputs = StepInputs(duration / rule.first, rule.first, down, jnp.zeros_like(duration), colliders, contact, pins)
         whole = replace(rule.config, box=None)
         end, path, health = simulate_compiled(particles, grid, table, whole, inputs, frames=frames)
     else:
@@ -204,6 +210,7 @@ def rollout(
             gravity=down,
             colliders=colliders,
             contact=contact,
+            pins=pins,
             active_grid=None if sleep is None else Sleeper(settings=sleep, body=np.asarray(particles.body)),
         )
         end, path, health = collect(loop, frames)
@@ -225,13 +232,14 @@ def _compiled(
     gravity: Any,
     colliders: tuple[Collider, ...],
     contact: BodyContact | None,
+    pins: tuple[Region, ...],
     frames: int,
     substeps: int,
 ) -> tuple[Particles, Trajectory, Health]:
     """Frames as one program, with numbers in the precision of the particles."""
-    numbers = (dt, jnp.asarray(gravity), grid, table, colliders, contact)
-    dt, gravity, grid, table, colliders, contact = _like(numbers, particles)
-    inputs = StepInputs(dt, substeps, gravity, jnp.zeros_like(dt), colliders, contact)
+    numbers = (dt, jnp.asarray(gravity), grid, table, colliders, contact, pins)
+    dt, gravity, grid, table, colliders, contact, pins = _like(numbers, particles)
+    inputs = StepInputs(dt, substeps, gravity, jnp.zeros_like(dt), colliders, contact, pins)
     return simulate_compiled(particles, grid, table, config, inputs, frames=frames)
 
 
