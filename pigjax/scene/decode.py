@@ -101,8 +101,9 @@ def _range(kind: Any) -> str:
 
 def _value(value: Any, kind: Any, name: str) -> Any:
     bare = _bare(kind)
-    if isinstance(bare, type) and issubclass(bare, Section):
-        return decode(value, bare, name)
+    section = next((part for part in (bare, *get_args(bare)) if _is_section(part)), None)
+    if section is not None and get_origin(bare) is not dict:  # also one that may be left out
+        return decode(value, section, name)
     if get_origin(bare) is dict and get_args(bare)[1] is not Any:
         if not isinstance(value, Mapping):
             raise SceneError(f"{name} = {shown(value)}: it must be a table.")
@@ -119,6 +120,10 @@ def _value(value: Any, kind: Any, name: str) -> Any:
         raise SceneError(f"{name}{at} = {shown(_item(value, at))}: it must be {wanted(kind)}.") from None
     _check(made, limits_of(kind), name)
     return made
+
+
+def _is_section(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, Section)
 
 
 def _check(made: Any, limits: Limits, name: str) -> None:

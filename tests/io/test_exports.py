@@ -375,7 +375,9 @@ def test_meshes_come_back(tmp_path, suffix):
             told = [gltf.accessors[i] for i in (mesh.primitives[0].attributes.POSITION, mesh.primitives[0].indices)]
             views = [gltf.bufferViews[accessor.bufferView] for accessor in told]
             points = np.frombuffer(blob, "<f4", 12, views[0].byteOffset).reshape(-1, 3)
-            parts.append((points, first + np.frombuffer(blob, "<u4", 12, views[1].byteOffset).reshape(-1, 3).astype(int)))
+            parts.append(
+                (points, first + np.frombuffer(blob, "<u4", 12, views[1].byteOffset).reshape(-1, 3).astype(int))
+            )
             first += len(points)
         vertices, faces = (np.concatenate(values) for values in zip(*parts))
     corners = vertices[faces]
