@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.text import Text
 
 from pigjax.core.errors import InputError
+from pigjax.io.compile_cache import use_compile_cache
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 # names come from files: nothing that is printed is taken for markup, a style is given by `said`
@@ -64,6 +65,12 @@ def said(text: object, *, label: str = "", style: str = "") -> Text:
 def row(*cells: object) -> tuple[Text, ...]:
     """Cells of a table, printed literally."""
     return tuple(said(cell) for cell in cells)
+
+
+def prepare_jax() -> None:
+    """Use all cores, and keep compiled programs for the next command."""
+    one_device_per_core()
+    use_compile_cache()
 
 
 def one_device_per_core() -> None:

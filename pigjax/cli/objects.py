@@ -17,7 +17,7 @@ from pigjax.cli.base import (
     Overwrite,
     app,
     console,
-    one_device_per_core,
+    prepare_jax,
     output_path,
     progress,
     row,
@@ -65,7 +65,7 @@ def reconstruct(
     overwrite: Overwrite = False,
 ) -> None:
     """Fit Gaussians to photos; writes OUT/gaussians.ply, and goes on from OUT/checkpoint if it was stopped."""
-    one_device_per_core()
+    prepare_jax()
     import jax
 
     from pigjax import io

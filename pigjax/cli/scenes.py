@@ -18,7 +18,7 @@ from pigjax.cli.base import (
     Overwrite,
     app,
     console,
-    one_device_per_core,
+    prepare_jax,
     output_path,
     progress,
     row,
@@ -66,7 +66,7 @@ def run(
 
 
 def _run(path: Path, out: Path, accuracy: str | None, *, drop_invalid: bool = False, overwrite: bool = False) -> None:
-    one_device_per_core()
+    prepare_jax()
     from pigjax.scene import load_scene, run_scene
 
     scene = load_scene(path, accuracy=accuracy)
@@ -113,7 +113,7 @@ def view(
     origin: Origin = None,
 ) -> None:
     """Draw a file from all around."""
-    one_device_per_core()
+    prepare_jax()
     from pigjax import io
     from pigjax.cli.turntable import turntable
 

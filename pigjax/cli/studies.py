@@ -10,7 +10,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from pigjax.cli.base import Out, Overwrite, app, console, one_device_per_core, progress, row, said
+from pigjax.cli.base import Out, Overwrite, app, console, prepare_jax, progress, row, said
 
 
 @app.command()
@@ -23,7 +23,7 @@ def sweep(
     overwrite: Overwrite = False,
 ) -> None:
     """Score every set of parameters of a study: OUT/table.csv, a plot, and the best as a scene; goes on if stopped."""
-    one_device_per_core()
+    prepare_jax()
     if coordinator is not None:
         _join(coordinator, processes, process)
     from pigjax.study import load_study, sweep_study
@@ -63,7 +63,7 @@ def tune(
     overwrite: Overwrite = False,
 ) -> None:
     """Find the parameters of least loss: OUT/history.png, and the best as a scene OUT/best.toml; goes on if stopped."""
-    one_device_per_core()
+    prepare_jax()
     from pigjax.study import load_study, tune_study
 
     loaded = load_study(study, method=method)
