@@ -38,7 +38,8 @@ def use_compile_cache() -> None:
     """
     import jax
 
-    if jax.config.jax_compilation_cache_dir or (folder := cache_folder()) is None:
+    given = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    if given or (folder := cache_folder()) is None:
         return
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
