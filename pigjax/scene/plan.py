@@ -24,9 +24,11 @@ from pigjax.mls_mpm import SimConfig
 from pigjax.mpm import Particles
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.forces import Force
 from pigjax.mpm.materials import Material, MaterialTable
 from pigjax.mpm.sleep import Sleep
 from pigjax.objects.lifting import lift
+from pigjax.scene.forces import forces_of
 from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, RenderConfig
@@ -52,6 +54,7 @@ class Plan:
     binding: Binding | None
     colliders: tuple[Collider, ...]
     contact: BodyContact | None
+    forces: tuple[Force, ...]  # beside gravity
     sleep: Sleep | None
     gravity: Float[np.ndarray, "3"]
     config: SimConfig
@@ -190,6 +193,7 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         binding=binding if len(binding) else None,
         colliders=colliders,
         contact=_contact(spec, len(moving)),
+        forces=forces_of(scene.forces, particles, {name: number for number, name in enumerate(moving)}),
         sleep=None if spec.sleep is None else Sleep(speed=spec.sleep),
         gravity=vector,
         config=SimConfig(kernel=spec.kernel, cfl=spec.cfl, integrator=spec.integrator),
