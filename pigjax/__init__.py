@@ -9,6 +9,7 @@ from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.core.camera import Camera, interpolate_path, look_at, orbit, stack_cameras
 from pigjax.core.errors import InputError, MissingFileError, SceneError, SimulationError
 from pigjax.core.metrics import boundary_iou, mean_iou, psnr, ssim
+from pigjax.core.regions import BoxRegion, HalfSpace, SphereRegion
 from pigjax.coupling.binding import at_frame, bind, deform
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
@@ -58,6 +59,7 @@ __all__ = [
     "BodyContact",
     "Bounds",
     "Box",
+    "BoxRegion",
     "Camera",
     "Capsule",
     "ClampParams",
@@ -67,6 +69,7 @@ __all__ = [
     "Frame",
     "Gaussians",
     "Grid",
+    "HalfSpace",
     "Health",
     "InputError",
     "Labels",
@@ -84,6 +87,7 @@ __all__ = [
     "SimulationError",
     "Sleep",
     "Sphere",
+    "SphereRegion",
     "Splats",
     "Table",
     "Trajectory",

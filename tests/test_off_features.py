@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pigjax.core.regions import HalfSpace
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, group_by_law, make_particles
 from pigjax.mpm.colliders import Plane
@@ -39,7 +40,7 @@ def material(law, **numbers):
     return Material(law, **{**ELASTIC, **own, **numbers})
 
 
-def traced(materials=None, *, colliders=(), contact=None, **config):
+def traced(materials=None, *, colliders=(), contact=None, pins=(), **config):
     """One step of two particles of the first material."""
     table = material_table(materials or [material("neo_hookean")])
     particles = make_particles(jnp.full((2, 3), 0.6), volume=1e-4, table=table)
@@ -48,7 +49,7 @@ def traced(materials=None, *, colliders=(), contact=None, **config):
         settings = SimConfig(substeps=1, devices=1, **config)
         return rollout(
             particles, DOMAIN, table, settings, frames=1, frame_dt=1e-3, gravity=(0.0, 0.0, -9.8), colliders=colliders,
-            contact=contact,
+            contact=contact, pins=pins,
         )  # fmt: skip
 
     return jax.make_jaxpr(run)(particles, table)
@@ -89,6 +90,7 @@ def plain():
 def test_tracing_is_deterministic_and_this_test_sees_a_difference(plain):
     assert text(traced()) == text(plain)
     assert text(traced(walls="slip")) != text(plain)
+    assert text(traced(pins=(HalfSpace((0.0, 0.0, 0.4), (0.0, 0.0, 1.0)),))) != text(plain)
 
 
 @pytest.mark.parametrize(
@@ -96,6 +98,7 @@ def test_tracing_is_deterministic_and_this_test_sees_a_difference(plain):
     [
         {"colliders": ()},
         {"contact": None},
+        {"pins": ()},
         {"kernel": "quadratic"},
         {"integrator": "explicit"},
         {"differentiation": "reverse"},

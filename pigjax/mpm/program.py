@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.arrays import everywhere, in_precision
 from pigjax.core.errors import InputError
+from pigjax.core.regions import Region
 from pigjax.mpm import (
     Grid,
     Health,
@@ -69,6 +70,7 @@ class StepInputs(NamedTuple):
     start: Float[Array, ""]  # time since the colliders were where their numbers say, by which forces go [s]
     colliders: tuple[Collider, ...] = ()
     contact: BodyContact | None = None  # between bodies; None: they share one velocity field
+    pins: tuple[Region, ...] = ()  # where matter does not move
     forces: tuple[Force, ...] = ()  # beside gravity
 
     @property
@@ -130,7 +132,7 @@ def run_frames(
         collider_contacts=tuple(None if c.moves else c.contact(points) for c in inputs.colliders),
         body_contact=contact,
         specific_volume=None if contact is None else _specific_volume(particles, contact.bodies) / grid.dx**3,
-        frozen=None if still is None else touched_nodes(grid, still.x, kernel),
+        frozen=_held_nodes(None if still is None else touched_nodes(grid, still.x, kernel), inputs.pins, points),
         unit_mass=lax.stop_gradient(jnp.where(jnp.isfinite(particles.mass), particles.mass, 0).max()),
         opaque_true=everywhere(~(particles.volume0[0] < -jnp.finfo(dtype).max)),  # true of NaN too
         forces=without_weights(inputs.forces),
@@ -292,6 +294,16 @@ def _counted(statics: StepStatics, health: StepHealth, states: tuple[State, ...]
     escaped, inverted, wall_hits, gone = counts
     nonfinite = gone - statics.fillers
     return StepHealth(least, most, escaped, nonfinite, inverted, health.unconverged, wall_hits, sides_met=met)
+
+
+def _held_nodes(
+    touched: Bool[Array, "x y z"] | None, pins: tuple[Region, ...], points: Float[Array, "x y z 3"]
+) -> Bool[Array, "x y z"] | None:
+    """Nodes without velocity: those that stationary matter touches, and those in pinned regions; None for none."""
+    for region in pins:
+        inside = region.contains(points)
+        touched = inside if touched is None else touched | inside
+    return touched
 
 
 def _specific_volume(particles: Particles, bodies: int) -> Float[Array, "b"]:

@@ -73,7 +73,7 @@ class StepContext(NamedTuple):
     collider_contacts: tuple[Contact | None, ...]  # of the colliders that do not move; None: found at each step
     body_contact: BodyContact | None  # between bodies, each of which has a grid of its own beside the others
     specific_volume: Float[Array, "b"] | None  # of each body, on average [cells/kg]
-    frozen: Bool[Array, "nx ny nz"] | None  # nodes that stationary matter touches
+    frozen: Bool[Array, "nx ny nz"] | None  # nodes that stationary matter touches, or that are pinned
     unit_mass: Float[Array, ""]  # of the heaviest particle [kg]
     opaque_true: Bool[Array, ""]  # for `transfers.no_fuse`
     forces: tuple[Force, ...] = ()  # beside gravity; particles carry their weights
@@ -403,11 +403,11 @@ def apply_boundaries(
     time: Time,
     press: Sequence[Press] | None = None,
 ) -> Float[Array, "n y z 3"]:
-    """Velocities of the nodes [m/s] after colliders, stationary matter and the walls of the domain.
+    """Velocities of the nodes [m/s] after colliders, stationary matter, pins and the walls of the domain.
 
     Args:
         statics: the walls' mode.
-        context: colliders, nodes that stationary matter touches, and the window of the domain.
+        context: colliders, nodes that stationary matter touches or that are pinned, and the window of the domain.
         velocity: of the nodes, of each body if there are several [m/s].
         time: since the colliders were where their numbers say [s].
         press: how nodes press against each collider, if friction must follow that; None: by their velocity.

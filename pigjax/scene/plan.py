@@ -78,7 +78,9 @@ def read_inputs(scene: Scene) -> Inputs:
     views = None
     if spec.views is not None:
         masks = True if spec.masks is None else scene.path(spec.masks)
-        views = io.load_views(scene.path(spec.views), masks=masks, max_size=spec.max_size, origin=spec.origin)
+        views = io.load_views(
+            scene.path(spec.views), masks=masks, missing_masks="abstain", max_size=spec.max_size, origin=spec.origin
+        )
     if scene.camera.view is not None:
         _camera_of_view(scene.camera, views)
     return Inputs(gaussians, views, ids, names)
@@ -116,7 +118,7 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
         ids = jnp.asarray(sorted({0, only}), jnp.int32)
         votes = jnp.zeros((count, len(ids)), jnp.int32)
         return Labels(jnp.full(count, only, jnp.int32), votes, jnp.ones(count), ids=ids)
-    views = inputs.views.training
+    views = inputs.views.voters
     assert views.masks is not None
     check_ids_occur(inputs.ids, views.masks)
     labels = lift(
