@@ -71,7 +71,9 @@ class Force(eqx.Module):
         check_fields(self)
         name = type(self).__name__
         if self.region is not None and not isinstance(self.region, Region):
-            raise InputError(f"{name}.region is {type(self.region).__name__}: give a BoxRegion, SphereRegion, HalfSpace.")
+            raise InputError(
+                f"{name}.region is {type(self.region).__name__}: give a BoxRegion, SphereRegion, HalfSpace."
+            )
         both = (self.start, self.end)
         if None not in both and is_known(both) and float(self.end) < float(self.start):  # type: ignore[arg-type]
             raise InputError(f"{name}.end = {float(self.end)}: it must not be before start = {float(self.start)} s.")  # type: ignore[arg-type]
@@ -127,12 +129,14 @@ class Force(eqx.Module):
         acting = float(self.acting(duration, time))
         if acting <= 0:
             return 0.0
-        rates = _finite_norms(self._share(particles) * self.acceleration_of(particles.x, particles.v, self.elapsed + time))
+        rates = _finite_norms(
+            self._share(particles) * self.acceleration_of(particles.x, particles.v, self.elapsed + time)
+        )
         most = float(np.max(rates, initial=0.0))
         return min(most * acting, math.sqrt(2 * most * reach))
 
     def touches(self, x: Float[Array, "p 3"], time: float, duration: float) -> Bool[np.ndarray, "p"]:
-        """Which particles it acts on between a time [s] and a duration [s] later, if they stay where they are (host)."""
+        """Which particles it acts on from a time [s] for a duration [s], if they stay where they are (host)."""
         touched = np.full(len(x), float(self.acting(duration, time)) > 0)
         if self.weights is not None:
             touched &= np.asarray(self.weights) > 0
@@ -203,7 +207,9 @@ class Wind(Force):
         """The wind's own greatest speed."""
         if float(self.acting(duration, time)) <= 0:
             return 0.0
-        gusts = 0.0 if self.gusts is None else float(self.gusts) * float(np.linalg.norm(_waves(self.seed)[2], axis=1).sum())
+        gusts = (
+            0.0 if self.gusts is None else float(self.gusts) * float(np.linalg.norm(_waves(self.seed)[2], axis=1).sum())
+        )
         return float(np.linalg.norm(np.asarray(self.velocity))) + gusts
 
     def _rate(self, ahead: Points) -> Float[Array, "*n 1"] | Scalar:
@@ -426,9 +432,7 @@ def weights_of(forces: tuple[Force, ...]) -> Float[Array, "p k"] | None:
 
 def without_weights(forces: tuple[Force, ...]) -> tuple[Force, ...]:
     """The forces without their weights, which the particles carry."""
-    return tuple(
-        force if force.weights is None else eqx.tree_at(lambda f: f.weights, force, None) for force in forces
-    )
+    return tuple(force if force.weights is None else eqx.tree_at(lambda f: f.weights, force, None) for force in forces)
 
 
 def of_some(forces: tuple[Force, ...], index: Any) -> tuple[Force, ...]:
@@ -451,9 +455,7 @@ def check_forces(forces: tuple[Force, ...], count: int) -> None:
 
 def _waves(
     seed: int,
-) -> tuple[
-    Float[np.ndarray, "k"], Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"], Float[np.ndarray, "k"]
-]:
+) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"], Float[np.ndarray, "k"]]:
     """Wave numbers relative to the longest wave's, unit directions, velocities across them and phases of gusts.
 
     The energy of a wave falls with its number to the power 2/3 (Kolmogorov); the mean square of their sum is 1.

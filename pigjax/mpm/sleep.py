@@ -2,8 +2,8 @@
 
 Bodies are those of `Particles.body`. Between frames the bounding boxes of moving bodies, grown by the kernel's reach
 and by the largest displacement of a frame, decide which bodies are awake: a body wakes before it is touched. Bodies
-that touch each other therefore sleep and wake together. A body that a force acts on, beside gravity, is awake. A frame in which a body got farther than its speed had bounded
-is computed again, together with the bodies that it came near.
+that touch each other therefore sleep and wake together. A body that a force beside gravity acts on is awake. A frame in
+which a body got farther than its speed had bounded is computed again, together with the bodies that it came near.
 
 Each set of awake bodies is another compilation, so that sleep pays in long simulations of few bodies.
 """

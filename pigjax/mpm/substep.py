@@ -1,7 +1,8 @@
 """One substep of MLS-MPM with APIC: `particles_to_grid` (P2G), `update_grid`, `grid_to_particles` (G2P).
 
-Forces on particles come before P2G (`apply_forces`). The same functions serve forward simulation and the adjoint, which keeps the grid between the first and the
-second. `reference.py` has the same stages under the same names in plain form, without chunks or devices.
+Forces on particles come before P2G (`apply_forces`). The same functions serve forward simulation and the adjoint, which
+keeps the grid between the first and the second. `reference.py` has the same stages under the same names in plain form,
+without forces, chunks or devices.
 """
 
 from __future__ import annotations

@@ -38,7 +38,9 @@ class ForceSpec(Section, frozen=True, kw_only=True):
         yield "end", ordered, f"it must not be before start = {self.start} s"
         yield "objects", self.objects is None or len(self.objects) > 0, "name one or more, or leave it out for all"
 
-    def to_force(self, where: str, particles: Particles | None = None, bodies: Mapping[str, int] | None = None) -> Force:
+    def to_force(
+        self, where: str, particles: Particles | None = None, bodies: Mapping[str, int] | None = None
+    ) -> Force:
         """The force of these fields.
 
         Args:
@@ -49,7 +51,9 @@ class ForceSpec(Section, frozen=True, kw_only=True):
         Raises:
             SceneError: a number is out of range, or no matter is in the region of a spring.
         """
-        given = {name: value for name, value in asdict(self).items() if value is not None and name not in self.own_fields}
+        given = {
+            name: value for name, value in asdict(self).items() if value is not None and name not in self.own_fields
+        }
         region = None if self.region is None else self.region.to_region(joined(where, "region"))
         try:
             weights = None if particles is None else self._weights(where, particles, bodies or {})
@@ -132,9 +136,7 @@ class SpringSpec(ForceSpec, frozen=True, kw_only=True):
 AnyForce = WindSpec | FieldSpec | ImpulseSpec | SpringSpec
 
 
-def forces_of(
-    forces: Mapping[str, AnyForce], particles: Particles, bodies: Mapping[str, int]
-) -> tuple[Force, ...]:
+def forces_of(forces: Mapping[str, AnyForce], particles: Particles, bodies: Mapping[str, int]) -> tuple[Force, ...]:
     """The forces of a scene on its particles at rest.
 
     Args:
