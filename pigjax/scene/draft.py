@@ -31,6 +31,7 @@ AXES = ("x", "y", "z", "-x", "-y", "-z")
 THUMBNAIL = 192  # px
 _BINS = 60  # of the heights in which a ground is looked for
 _LEAST_GROUND = 0.12  # share of the splats in a layer that counts as a ground
+_WIDER = 1.3  # times the area of what is above it that a ground has
 _FEWEST = 50  # Gaussians of a part that is offered as an object
 _MOST_PARTS = 16
 _SUPPORTS = ("table", "desk", "floor", "ground", "shelf", "plinth", "pot", "wall", "bench", "board")
@@ -107,7 +108,7 @@ def draft_scene(
         up, told = up_of_cameras(views.cameras) if views is not None else up_of_ground(means[core])
         remarks.append(told)
     axis = _axis(up)
-    ground = ground_height(means[core] @ axis)
+    ground = ground_height(means[core], axis)
     if views is not None and views.masks is not None:
         parts, labels, ground = _masked_parts(gaussians, views, names), None, None
         height = min(_lowest(part, axis) for part in parts)
@@ -147,10 +148,20 @@ def up_of_ground(means: Float[np.ndarray, "n 3"]) -> tuple[str, str]:
     return best, f"up = {best}: {100 * shares[best]:.0f} % of the splats lie in one layer at that axis' lower end."
 
 
-def ground_height(heights: Float[np.ndarray, "n"]) -> float | None:
-    """Height of the ground [m] among heights of a scene's splats; None where no layer at the lower end stands out."""
-    share, height = _ground_layer(heights)
-    return height if share >= _LEAST_GROUND else None
+def ground_height(means: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, "3"]) -> float | None:
+    """Height of the ground [m] along an axis that points up; None where there is none.
+
+    It is a layer at the lower end that holds an eighth of the splats and spreads wider than what is above it: not the
+    flat bottom of an object.
+    """
+    heights = means @ axis
+    share, height, top = _ground_layer(heights)
+    if share < _LEAST_GROUND:
+        return None
+    across = means[:, np.abs(axis) < 0.5]
+    layer, above = ((heights <= top) & (heights >= height - (top - height)), heights > top)
+    areas = [float(np.prod(np.subtract(*np.quantile(across[k], [0.95, 0.05], axis=0)))) for k in (layer, above)]
+    return height if areas[0] > _WIDER * areas[1] else None
 
 
 def thumbnails(
@@ -189,17 +200,18 @@ def _highest(part: Part, axis: Float[np.ndarray, "3"]) -> float:
     return float(max(part.low @ axis, part.high @ axis))
 
 
-def _ground_layer(heights: Float[np.ndarray, "n"]) -> tuple[float, float]:
-    """Share of the splats in the fullest layer of the lower third, and its height [m]; 0 where little is above it."""
+def _ground_layer(heights: Float[np.ndarray, "n"]) -> tuple[float, float, float]:
+    """Share of the splats in the fullest layer of the lower third, 0 where little is above; its height and end [m]."""
     low, high = np.quantile(heights, [0.005, 0.995])
     if not high > low:
-        return 0.0, float(low)
+        return 0.0, float(low), float(low)
     counts, edges = np.histogram(heights, _BINS, (low, high))
     layers = counts[:-1] + counts[1:]
     k = int(np.argmax(layers[: _BINS // 3]))
     inside = heights[(heights >= edges[k]) & (heights <= edges[k + 2])]
     above = float((heights > edges[k + 2]).mean())
-    return (float(len(inside) / len(heights)) if above > 0.1 else 0.0), float(np.median(inside))
+    share = float(len(inside) / len(heights)) if above > 0.1 else 0.0
+    return share, float(np.median(inside)), float(edges[k + 2])
 
 
 def _masked_parts(gaussians: Gaussians, views: io.Views, names: dict[int, str]) -> list[Part]:
@@ -334,8 +346,11 @@ def _text(
     moving = [part for part in parts if not part.fixed]
     dx = _rounded(min(part.size for part in moving) / _CELLS)
     tall = max(_highest(part, axis) - _lowest(part, axis) for part in moving)
-    point = ", ".join(f"{value:.4g}" for value in axis * height)
-    normal = ", ".join(f"{value:g}" for value in axis)
+    point = ", ".join(f"{value + 0.0:.4g}" for value in axis * height)
+    normal = ", ".join(f"{value + 0.0:g}" for value in axis)
+    tallest = max(moving, key=lambda part: _highest(part, axis) - _lowest(part, axis))
+    held = _lowest(tallest, axis) + 0.15 * tall
+    foot = ", ".join(f"{value + 0.0:.4g}" for value in axis * held)
     lines = [
         "# Written by `pigjax new` to be edited; lines behind # are choices. Run it: pigjax run scene.toml -o out",
         *(f"# {remark}" for remark in remarks),
@@ -345,8 +360,8 @@ def _text(
         f"up = {_quoted(up)} # axis of the scene that points up: x, y, z, -x, -y or -z",
         "",
         "# Lengths are in the units of the splats, read as metres. Cameras of COLMAP have no scale: the tallest moving",
-        f"# object is {tall:.3g} units tall here. If that is not its height in metres, matter is too heavy or too light",
-        "# for its stiffness: multiply young (and yield_stress, cohesion) by units per metre.",
+        f"# object is {tall:.3g} units tall here. If that is not its height in metres, it weighs too much or too",
+        "# little for its stiffness: multiply young (and yield_stress, cohesion) by units per metre.",
         "[simulation]",
         f"dx = {dx:g} # grid spacing [m]: a sixteenth of the smallest moving object; smaller is finer and slower",
         "frames = 48",
@@ -364,6 +379,10 @@ def _text(
         f"point = [{point}] # m",
         f"normal = [{normal}]",
         "friction = 0.5 # Coulomb's coefficient",
+        "",
+        "# [pinned.foot] # matter behind this plane does not move, as a plant in its pot",
+        f"# point = [{foot}] # m",
+        f"# normal = [{normal}]",
         "",
         "# [forces.breeze] # beside gravity: kind = wind, field, impulse or spring",
         '# kind = "wind"',

@@ -50,11 +50,14 @@ def test_up_and_ground_of_a_cloud(cloud):
     up, told = up_of_ground(cloud)
     assert up == "-y"
     assert "in one layer" in told
-    assert ground_height(-cloud[:, 1]) == pytest.approx(-0.1, abs=0.02)
+    assert ground_height(cloud, np.array([0.0, -1.0, 0.0])) == pytest.approx(-0.1, abs=0.02)
     ball = sphere(np.zeros(3), 1.0, 4000, np.random.default_rng(1))
     assert up_of_ground(ball)[0] == "z"
     assert "a guess" in up_of_ground(ball)[1]
-    assert ground_height(ball[:, 2]) is None
+    assert ground_height(ball, np.array([0.0, 0.0, 1.0])) is None
+    mushroom = np.concatenate([0.5 * sphere(np.zeros(3), 1.0, 3000, np.random.default_rng(2)) * [1, 1, 0.01], ball])
+    assert up_of_ground(mushroom + np.where(np.arange(7000) < 3000, -2, 0)[:, None] * [0, 0, 1])[0] == "z"
+    assert ground_height(mushroom + np.where(np.arange(7000) < 3000, -2, 0)[:, None] * [0, 0, 1], np.eye(3)[2]) is None
 
 
 def test_up_of_cameras_is_their_own():
