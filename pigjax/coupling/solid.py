@@ -104,9 +104,7 @@ def large_parts(sizes: Int[np.ndarray, "c"], count: int) -> Bool[np.ndarray, "c"
     return large
 
 
-def parts_of(
-    means: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"]
-) -> tuple[Int[np.ndarray, "n"], float]:
+def parts_of(means: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "n"], float]:
     """Number of the connected part that each Gaussian belongs to, and the typical distance between neighbours [m].
 
     Neighbours are linked where their gap is at most four times the typical one, or twice their standard deviations.
