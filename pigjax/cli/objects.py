@@ -79,7 +79,9 @@ def reconstruct(
 
     needs_masks = only is not None or random_background
     doublings = max(math.ceil(math.log2(splats / start_splats)), 1) if start_splats else 1
-    loaded = io.load_views(views, masks=needs_masks, max_size=max_size, background=background, origin=origin)
+    loaded = io.load_views(
+        views, masks=needs_masks, missing_masks="abstain", max_size=max_size, background=background, origin=origin
+    )
     points = io.load_points(loaded.points_path, origin=origin) if loaded.points_path else None
     config = FitConfig(
         steps=steps,
@@ -174,7 +176,7 @@ def segment(
     from pigjax.cli.segmenting import segment_files
 
     cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid, origin=origin)
-    loaded = io.load_views(views, masks=masks if masks is not None else True, origin=origin)
+    loaded = io.load_views(views, masks=masks if masks is not None else True, missing_masks="abstain", origin=origin)
     known = {} if names is None else io.load_names(names)
     settings = _settings(tau_t, tau_d, weighting, purity, min_seen)
     counts = segment_files(
