@@ -29,6 +29,7 @@ from pigjax.mls_mpm import SimConfig, rollout, step
 from pigjax.mpm import Grid, Health, Particles, Trajectory, fit_grid, make_particles, vast_grid
 from pigjax.mpm.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
 from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.forces import Force, ForceField, Impulse, Spring, Wind, grab
 from pigjax.mpm.materials import Material, MaterialTable, material_table, preset
 from pigjax.mpm.sleep import Sleep
 from pigjax.mpm.timestep import choose_integrator, choose_substeps, stable_dt
@@ -66,11 +67,14 @@ __all__ = [
     "Cylinder",
     "Experiment",
     "FitConfig",
+    "Force",
+    "ForceField",
     "Frame",
     "Gaussians",
     "Grid",
     "HalfSpace",
     "Health",
+    "Impulse",
     "InputError",
     "Labels",
     "Material",
@@ -89,9 +93,11 @@ __all__ = [
     "Sphere",
     "SphereRegion",
     "Splats",
+    "Spring",
     "Table",
     "Trajectory",
     "Views",
+    "Wind",
     "associate_masks",
     "at_frame",
     "bind",
@@ -109,6 +115,7 @@ __all__ = [
     "fill_unseen",
     "fit",
     "fit_grid",
+    "grab",
     "hole_mask",
     "interpolate_path",
     "lift_masks",

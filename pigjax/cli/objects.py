@@ -12,13 +12,15 @@ from rich.table import Table
 
 from pigjax.cli.base import (
     DropInvalid,
+    NoCache,
     Origin,
     Out,
     Overwrite,
+    Quiet,
     app,
     console,
-    one_device_per_core,
     output_path,
+    prepare_jax,
     progress,
     row,
     said,
@@ -64,9 +66,11 @@ def reconstruct(
     seed: int = 0,
     origin: Origin = None,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Fit Gaussians to photos; writes OUT/gaussians.ply, and goes on from OUT/checkpoint if it was stopped."""
-    one_device_per_core()
+    prepare_jax()
     import jax
 
     from pigjax import io
@@ -176,6 +180,8 @@ def segment(
     drop_invalid: DropInvalid = False,
     origin: Origin = None,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Lift masks to the Gaussians; writes labels, one .ply per object, and a sheet that shows which id is which.
 
@@ -236,6 +242,8 @@ def evaluate(
     drop_invalid: DropInvalid = False,
     origin: Origin = None,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Score objects against true masks (mIoU, mBIoU); writes OUT/scores.json and OUT/sheet.png."""
     from pigjax import io

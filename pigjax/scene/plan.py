@@ -28,10 +28,12 @@ from pigjax.mls_mpm import SimConfig
 from pigjax.mpm import Particles
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.forces import Force
 from pigjax.mpm.materials import Material, MaterialTable
 from pigjax.mpm.sleep import Sleep
 from pigjax.objects.lifting import lift
 from pigjax.scene.advice import default_dx, remarks_on
+from pigjax.scene.forces import forces_of
 from pigjax.scene.framing import framing_camera
 from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec
 from pigjax.segmentation import Labels, fill_unseen
@@ -62,6 +64,7 @@ class Plan:
     binding: Binding | None
     colliders: tuple[Collider, ...]
     contact: BodyContact | None
+    forces: tuple[Force, ...]  # beside gravity
     sleep: Sleep | None
     gravity: Float[np.ndarray, "3"]
     config: SimConfig
@@ -278,6 +281,7 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         binding=binding if len(binding) else None,
         colliders=colliders,
         contact=_contact(spec, len(moving)),
+        forces=forces_of(scene.forces, particles, {name: number for number, name in enumerate(moving)}),
         sleep=None if spec.sleep is None else Sleep(speed=spec.sleep),
         gravity=vector,
         config=SimConfig(kernel=spec.kernel, cfl=spec.cfl, integrator=spec.integrator),
@@ -435,8 +439,10 @@ def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
     Nor does the name of the accuracy count, but the values that it set do; files count by their content.
     """
     settings: dict[str, Any] = msgspec.to_builtins(scene)
-    for name in ("accuracy", "camera", "clamp", "drawing", "folder"):
+    for name in ("accuracy", "camera", "clamp", "drawing", "folder", "output"):
         settings.pop(name)
+    if scene.output.compress_states:
+        settings["output"] = {"compress_states": True}
     for name in ("gaussians", "views", "masks", "labels", "names"):
         settings["input"].pop(name)
     views = inputs.views

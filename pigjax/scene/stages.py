@@ -43,6 +43,7 @@ def stages_of(plan: Plan, frames: int) -> list[Stage]:
             frame_dt=plan.frame_dt,
             gravity=plan.gravity,
             colliders=plan.colliders,
+            forces=plan.forces,
         )
         stages.append(Stage(range(begin, end), table, rule))
     return stages
@@ -75,6 +76,7 @@ def simulate_stages(
             colliders=plan.colliders,
             contact=plan.contact,
             pins=plan.pins,
+            forces=plan.forces,
             active_grid=active_grid,
         ):
             yield frame
