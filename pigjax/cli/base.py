@@ -112,8 +112,7 @@ def row(*cells: object) -> tuple[Text, ...]:
 def prepare_jax() -> None:
     """Use all cores, keep compiled programs for the next command, and look for garbage less often.
 
-    Tracing makes objects by the million, and hardly any of them is garbage: looking at Python's default rate takes a
-    sixth of the time of compiling.
+    Tracing makes objects by the million, and hardly any of them is garbage: looking at the default rate slows it down.
     """
     one_device_per_core()
     use_compile_cache()
