@@ -173,7 +173,7 @@ def describe_file(path: Path) -> dict[str, str]:
         return described | (far if any(origin) else {})
     if path.suffix == ".toml":
         scene = load_scene(path)
-        moving = {name: entry.material or entry.model for name, entry in scene.objects.items() if not entry.fixed}
+        moving = {name: entry.material or entry.model for name, entry in scene.objects.items() if entry.moves}
         return {
             "Gaussians": str(scene.path(scene.input.gaussians)),
             "moving": ", ".join(f"{name} ({material})" for name, material in moving.items()),

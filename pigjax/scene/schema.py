@@ -165,6 +165,7 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     rotation: Annotated[Triple, _ANGLE] = (0.0, 0.0, 0.0)  # axis times angle, about its middle: [0, 0, 90] about z
     scale: Annotated[float, Limits(0, 1e6, above=True)] = 1.0  # times its size, about its middle
     copies: Annotated[list[Triple], _PLACE] = field(default_factory=list)  # offsets of more of it, each its own object
+    removed: bool = False  # its splats are left out, as if it had never stood there
     fixed: bool = False  # a still collider made from its own splats
     friction: Annotated[float, _FRICTION] = 0.5  # Coulomb's coefficient of a fixed object
     material: str | None = None
@@ -191,7 +192,12 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     fibre_elevation: Annotated[float, Limits(unit="rad")] | None = None
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
-        """A fixed object neither moves nor has a material."""
+        """A fixed object neither moves nor has a material, and one that is removed is not there."""
+        if self.removed:
+            rule = "an object that is removed has none; remove one of the two"
+            for name in ("material", "model"):
+                yield name, getattr(self, name) is None, rule
+            yield "fixed", not self.fixed, rule
         if self.fixed:
             for name in ("material", "model", *_NUMBERS):
                 yield name, getattr(self, name) is None, "a fixed object has no material; remove one of the two"
@@ -202,10 +208,15 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
         yield "gaussians", not both, "a file of its own needs no id and no region; remove one of the two"
 
     @property
+    def moves(self) -> bool:
+        """Whether it is matter."""
+        return not (self.fixed or self.removed)
+
+    @property
     def is_placed(self) -> bool:
         """Whether its Gaussians are not where the scene's file has them, or come from another file."""
         turned = any((*self.offset, *self.rotation)) or self.scale != 1
-        return turned or self.gaussians is not None or bool(self.copies)
+        return turned or self.gaussians is not None or bool(self.copies) or self.removed
 
     def to_material(self, name: str) -> Material:
         """The material of these fields.
@@ -317,7 +328,7 @@ class Scene(Section, frozen=True):
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """Something moves, objects can be told apart, contact has its integrator, and pictures have a size."""
-        moving = sum(not spec.fixed for spec in self.objects.values())
+        moving = sum(spec.moves for spec in self.objects.values())
         yield "objects", moving > 0, "none moves; give one a material"
         owners: dict[int, str] = {}
         for name, spec in self.objects.items():
@@ -325,7 +336,7 @@ class Scene(Section, frozen=True):
                 owner = owners.setdefault(spec.id, name)
                 rule = f"{spec.id} is the id of objects.{joined(owner)}, too; each object has an id of its own"
                 yield joined("objects", name, "id"), owner == name, rule
-        moving_names = [name for name, spec in self.objects.items() if not spec.fixed]
+        moving_names = [name for name, spec in self.objects.items() if spec.moves]
         for name, force in self.forces.items():
             for entry in force.objects or ():
                 known = entry in moving_names
@@ -429,7 +440,7 @@ def scene_from(
         if (dx := scene.simulation.dx) is not None:
             scene = replace(scene, simulation=replace(scene.simulation, dx=dx * LEVELS[level].coarsening))
         for name, spec in scene.objects.items():
-            if not spec.fixed:
+            if spec.moves:
                 spec.to_material(name)
             if spec.within is not None:
                 spec.within.to_region(joined("objects", name, "within"))
