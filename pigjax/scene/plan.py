@@ -40,6 +40,8 @@ from pigjax.segmentation import Labels, fill_unseen
 from pigjax.splat import Gaussians, RenderConfig
 from pigjax.splatting.types import extent_of
 
+_FRAMED = 0.98  # share of the moving matter that the default orbit frames
+
 
 @dataclass
 class Inputs:
@@ -389,6 +391,9 @@ def make_cameras(
     target = np.array(spec.target) if spec.target is not None else focus
     focal = width / (2 * np.tan(np.radians(spec.field_of_view) / 2))
     radius = spec.radius if spec.radius is not None else _default_radius(inputs.gaussians, target)
+    if spec.radius is None and matter is not None:  # from so far that all of the moving objects fits in
+        fits = np.quantile(np.linalg.norm(matter - target, axis=1), _FRAMED)
+        radius = max(radius, float(fits) / np.sin(np.arctan(min(width, height) / (2 * focal))))
     return orbit(
         target,
         radius=radius,
