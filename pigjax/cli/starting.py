@@ -41,8 +41,9 @@ def new(
     from pigjax.io.finding import find_parts
 
     found = find_parts(source)
-    given = {"gaussians": gaussians, "masks": masks, "names": names}
-    found = found._replace(**{key: path for key, path in given.items() if path is not None})
+    found = found._replace(
+        gaussians=gaussians or found.gaussians, masks=masks or found.masks, names=names or found.names
+    )
     if found.views is None and found.gaussians is None:
         for line in missing_poses(source, found.photos):
             console.print(said(line), soft_wrap=True)

@@ -99,8 +99,7 @@ def draft_scene(
     names = {} if names_path is None else io.load_names(names_path)
     views = None
     if views_path is not None:
-        masks = {} if masks_path is None else {"masks": masks_path, "missing_masks": "abstain"}
-        views = io.load_views(views_path, **masks)
+        views = io.load_views(views_path, masks=masks_path, missing_masks="abstain")
     core = extent_of(gaussians).core
     means = np.asarray(gaussians.means, np.float64)
     remarks: list[str] = []
