@@ -35,6 +35,7 @@ from pigjax.io.ply import load_ply, load_points, read_ply, save_ply
 from pigjax.io.points import save_points
 from pigjax.io.provenance import check_same, claim, digest, file_digest, parts_of
 from pigjax.io.state import (
+    ROWS,
     STATES,
     last_state,
     load_pytree,
@@ -54,6 +55,7 @@ from pigjax.io.video import read_video, write_video
 
 __all__ = [
     "LAYOUTS",
+    "ROWS",
     "STATES",
     "Dataset",
     "Mesh",

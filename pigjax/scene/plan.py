@@ -27,7 +27,7 @@ from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.materials import Material, MaterialTable
 from pigjax.mpm.sleep import Sleep
 from pigjax.objects.lifting import lift
-from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec
+from pigjax.scene.schema import INPUT_FILES, CameraSpec, ClampSpec, Scene, SimulationSpec
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, RenderConfig
 from pigjax.splatting.types import extent_of
@@ -68,10 +68,8 @@ def read_inputs(scene: Scene) -> Inputs:
         SceneError: an object has no id of its own, or `camera.view` is not the name of a photo.
     """
     spec = scene.input
-    names = {} if spec.names is None else io.load_names(scene.path(spec.names))
-    ids = {name: _id_of(name, scene, names) for name in scene.objects}
-    _check_ids(ids)
-    gaussians = io.load_gaussians(scene.path(spec.gaussians), drop_invalid=spec.drop_invalid, origin=spec.origin)
+    ids, names = read_ids(scene)
+    gaussians = read_gaussians(scene)
     views = None
     if spec.views is not None:
         masks = True if spec.masks is None else scene.path(spec.masks)
@@ -79,6 +77,37 @@ def read_inputs(scene: Scene) -> Inputs:
     if scene.camera.view is not None:
         _camera_of_view(scene.camera, views)
     return Inputs(gaussians, views, ids, names)
+
+
+def read_ids(scene: Scene) -> tuple[dict[str, int], dict[int, str]]:
+    """Id of each object of the scene, and the names that `input.names` gives to ids.
+
+    Raises:
+        InputError: the file of names is missing or damaged.
+        SceneError: an object has no id of its own.
+    """
+    names = {} if scene.input.names is None else io.load_names(scene.path(scene.input.names))
+    ids = {name: _id_of(name, scene, names) for name in scene.objects}
+    _check_ids(ids)
+    return ids, names
+
+
+def read_gaussians(scene: Scene) -> Gaussians:
+    """Gaussians of the scene at rest, in the frame in which they are simulated.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    spec = scene.input
+    return io.load_gaussians(scene.path(spec.gaussians), drop_invalid=spec.drop_invalid, origin=spec.origin)
+
+
+def to_capture(scene: Scene) -> Float[np.ndarray, "4 4"]:
+    """Transform from the frame of the simulation back to that of the Gaussians' file, less `input.origin`.
+
+    Exports pass through it, so that they lie where the capture does.
+    """
+    return np.eye(4)
 
 
 def _id_of(name: str, scene: Scene, names: dict[int, str]) -> int:
@@ -193,15 +222,20 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         sleep=None if spec.sleep is None else Sleep(speed=spec.sleep),
         gravity=vector,
         config=SimConfig(kernel=spec.kernel, cfl=spec.cfl, integrator=spec.integrator),
-        clamp=ClampParams(
-            tau_min=jnp.asarray(scene.clamp.tau_min),
-            tau_max=jnp.asarray(scene.clamp.tau_max),
-            lambda_R=jnp.asarray(scene.clamp.lambda_R),
-            lambda_S=jnp.asarray(scene.clamp.lambda_S),
-            relative=scene.clamp.relative,
-        ),
+        clamp=clamp_params(scene.clamp),
         frame_dt=1 / (spec.fps * spec.slow_motion),
         labels=labels,
+    )
+
+
+def clamp_params(spec: ClampSpec) -> ClampParams:
+    """Bounds and weights of a scene's eigen-clamp."""
+    return ClampParams(
+        tau_min=jnp.asarray(spec.tau_min),
+        tau_max=jnp.asarray(spec.tau_max),
+        lambda_R=jnp.asarray(spec.lambda_R),
+        lambda_S=jnp.asarray(spec.lambda_S),
+        relative=spec.relative,
     )
 
 
@@ -317,7 +351,7 @@ def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
     settings: dict[str, Any] = msgspec.to_builtins(scene)
     for name in ("accuracy", "camera", "clamp", "drawing", "folder"):
         settings.pop(name)
-    for name in ("gaussians", "views", "masks", "names"):
+    for name in INPUT_FILES:
         settings["input"].pop(name)
     views = inputs.views
     content = {

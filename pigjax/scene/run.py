@@ -27,13 +27,15 @@ from pigjax.mpm.timestep import substep_rule
 from pigjax.objects.overlay import legend_sheet, overlay
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
+from pigjax.scene.replay import COLLIDER_FILE, SCENE_FILE, rows_of, store_colliders
 from pigjax.scene.report import RunReport
-from pigjax.scene.schema import Scene
+from pigjax.scene.schema import Scene, values_of
 from pigjax.segmentation import Labels, pixel_ids
 from pigjax.splat import Gaussians, render
 
 _SHEET_FRAMES = 12
-_FILES = ("video.mp4", "contact_sheet.png", "objects.png", "labels.npz", "report.json")
+_FILES = ("video.mp4", "contact_sheet.png", "objects.png", "labels.npz")
+_FILES += (COLLIDER_FILE, SCENE_FILE, "report.json")
 Progress = Callable[[str, int, int], None]  # stage, done, of
 
 
@@ -44,8 +46,10 @@ def run_scene(
     """Simulate a scene and draw its video. Host.
 
     Into `out_dir` go `video.mp4`, `contact_sheet.png`, `objects.png` (the objects in their colours), `labels.npz`,
-    `states/<frame>.npz` (x, v and F_visual of every particle) and `report.json`. A run that was killed goes on from its
-    last state; when all states are there, only the video is redrawn.
+    `colliders.npz` (of still objects), `states/<frame>.npz` (x, v and F_visual of every particle),
+    `states/particles.npz` (Gaussian, object, material, mass and rest volume of each), `scene.toml` (every setting, to
+    reproduce) and `report.json`; `load_run` reads them. A run that was killed goes on from its last state; when all
+    states are there, only the video is redrawn.
 
     Args:
         scene: as `load_scene` gives it.
@@ -100,6 +104,9 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: 
             labels.ids,
             scene=_mark(scene, inputs),
         )
+        io.save_rows(out / "states", rows_of(plan.particles, labels), signature=key)
+        store_colliders(out / COLLIDER_FILE, scene, plan.colliders)
+        io.write_toml(out / SCENE_FILE, values_of(scene, out))
     _describe(scene, inputs, plan, labels, report)
     with report.stage("simulate"):
         _simulate(scene, plan, out / "states", parts, key, report, tell)
