@@ -12,11 +12,19 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
+<<<<<<< HEAD
 from pigjax.cli import exporting, objects, scenes, studies  # their commands join the app
 from pigjax.cli.base import app, console, one_device_per_core, said
 from pigjax.core.errors import InputError, SimulationError
 
 __all__ = ["app", "exporting", "main", "objects", "one_device_per_core", "scenes", "studies"]
+=======
+from pigjax.cli import objects, printing, scenes, studies  # their commands join the app
+from pigjax.cli.base import app, console, one_device_per_core, said
+from pigjax.core.errors import InputError, SimulationError
+
+__all__ = ["app", "main", "objects", "one_device_per_core", "printing", "scenes", "studies"]
+>>>>>>> main
 
 _STOPPED = "stopped; run the same command again to go on from the last saved state."
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -50,6 +58,7 @@ def main() -> None:
 
 
 def _tell(error: object, code: int) -> None:
+    console.quiet = False
     console.print(said(error, label="error: ", style="bold red"), soft_wrap=True)
     sys.exit(code)
 

@@ -15,6 +15,7 @@ from pigjax.cli.base import (
     Origin,
     Out,
     Overwrite,
+    Quiet,
     app,
     console,
     one_device_per_core,
@@ -63,6 +64,7 @@ def reconstruct(
     seed: int = 0,
     origin: Origin = None,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
 ) -> None:
     """Fit Gaussians to photos; writes OUT/gaussians.ply, and goes on from OUT/checkpoint if it was stopped."""
     one_device_per_core()
@@ -159,6 +161,7 @@ def segment(
     drop_invalid: DropInvalid = False,
     origin: Origin = None,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
 ) -> None:
     """Lift masks to the Gaussians; writes labels, one .ply per object, and a sheet that shows which id is which.
 
@@ -202,6 +205,7 @@ def evaluate(
     drop_invalid: DropInvalid = False,
     origin: Origin = None,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
 ) -> None:
     """Score objects against true masks (mIoU, mBIoU); writes OUT/scores.json and OUT/sheet.png."""
     from pigjax import io

@@ -37,7 +37,7 @@ def stable_dt(
     """Longest stable step [s].
 
     Explicit: Δt = cfl min(dx / (c + v), dx² / 4ν) with c the fastest pressure wave, v the speed of matter and ν the
-    largest kinematic viscosity (the bound of Courant, Friedrichs and Lewy, and that of diffusion). Implicit:
+    largest kinematic viscosity (the bound of Courant, Friedrichs and Lewy (1928), and that of diffusion). Implicit:
     Δt = cfl dx / v.
 
     Args:
@@ -75,7 +75,17 @@ def choose_integrator(
 ) -> SimConfig:
     """The configuration with its integrator "auto" decided (host): the one with the lower cost.
 
-    An implicit step costs about as much as 400 explicit ones. The other arguments are those of `choose_substeps`.
+    An implicit step costs about as much as 400 explicit ones.
+
+    Args:
+        particles: at the start.
+        grid: the whole domain.
+        table: materials.
+        config: returned as it is unless its integrator is "auto".
+        frames: number of frames, 1 or more.
+        frame_dt: duration of a frame [s].
+        gravity: [m/s²].
+        colliders: as they are at the start.
 
     Raises:
         InputError: a number is out of range, or no step is stable.

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import tomllib
 import types
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
@@ -58,6 +60,41 @@ def decode(values: Any, kind: type[S], name: str = "", **given: Any) -> S:
             said = f" = {shown(value)}" if isinstance(value, int | float | str | tuple) else ""
             raise SceneError(f"{joined(name, broken)}{said}: {rule}.")
     return made
+
+
+def settings_from(texts: Sequence[str] | None) -> dict[str, Any]:
+    """Nested values of texts such as "simulation.frames=8", as `merged` takes them.
+
+    A value is read as TOML reads it, and taken for a text where it is none: `objects.duck.material=rubber`.
+
+    Raises:
+        SceneError: a text has no "=", or its field is not a dotted name.
+    """
+    values: dict[str, Any] = {}
+    for text in texts or ():
+        name, equals, value = text.partition("=")
+        if not equals or (read := _read(name, value) or _read(name, json.dumps(value))) is None:
+            raise SceneError(f"--set {shown(text)}: give a field and its value, as in simulation.frames=8.")
+        values = merged(values, read)
+    return values
+
+
+def _read(name: str, value: str) -> dict[str, Any] | None:
+    """A line of TOML, nested as its dotted name says; None where it is none."""
+    line = f"{name} = {value}"
+    try:
+        return None if line.splitlines() != [line] else tomllib.loads(line)
+    except (tomllib.TOMLDecodeError, RecursionError):
+        return None
+
+
+def merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a file with those of the changes in their place, table by table."""
+    new = dict(values)
+    for key, change in changes.items():
+        both = isinstance(change, Mapping) and isinstance(new.get(key), Mapping)
+        new[key] = merged(new[key], change) if both else change
+    return new
 
 
 def numbers_of(kind: type[Struct]) -> Iterator[tuple[str, Any, Limits]]:

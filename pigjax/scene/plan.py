@@ -349,9 +349,15 @@ def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
     Nor does the name of the accuracy count, but the values that it set do; files count by their content.
     """
     settings: dict[str, Any] = msgspec.to_builtins(scene)
-    for name in ("accuracy", "camera", "clamp", "drawing", "folder"):
+    for name in ("accuracy", "camera", "clamp", "drawing", "folder", "output"):
         settings.pop(name)
+<<<<<<< HEAD
     for name in INPUT_FILES:
+=======
+    if scene.output.compress_states:
+        settings["output"] = {"compress_states": True}
+    for name in ("gaussians", "views", "masks", "names"):
+>>>>>>> main
         settings["input"].pop(name)
     views = inputs.views
     content = {
