@@ -12,19 +12,11 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-<<<<<<< HEAD
-from pigjax.cli import exporting, objects, scenes, studies  # their commands join the app
+from pigjax.cli import exporting, objects, printing, scenes, studies  # their commands join the app
 from pigjax.cli.base import app, console, one_device_per_core, said
 from pigjax.core.errors import InputError, SimulationError
 
-__all__ = ["app", "exporting", "main", "objects", "one_device_per_core", "scenes", "studies"]
-=======
-from pigjax.cli import objects, printing, scenes, studies  # their commands join the app
-from pigjax.cli.base import app, console, one_device_per_core, said
-from pigjax.core.errors import InputError, SimulationError
-
-__all__ = ["app", "main", "objects", "one_device_per_core", "printing", "scenes", "studies"]
->>>>>>> main
+__all__ = ["app", "exporting", "main", "objects", "one_device_per_core", "printing", "scenes", "studies"]
 
 _STOPPED = "stopped; run the same command again to go on from the last saved state."
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)

@@ -351,13 +351,9 @@ def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
     settings: dict[str, Any] = msgspec.to_builtins(scene)
     for name in ("accuracy", "camera", "clamp", "drawing", "folder", "output"):
         settings.pop(name)
-<<<<<<< HEAD
-    for name in INPUT_FILES:
-=======
     if scene.output.compress_states:
         settings["output"] = {"compress_states": True}
-    for name in ("gaussians", "views", "masks", "names"):
->>>>>>> main
+    for name in INPUT_FILES:
         settings["input"].pop(name)
     views = inputs.views
     content = {

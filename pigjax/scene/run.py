@@ -34,8 +34,9 @@ from pigjax.segmentation import Labels, pixel_ids
 from pigjax.splat import Gaussians, render
 
 _SHEET_FRAMES = 12
-_FILES = ("video.mp4", "contact_sheet.png", "objects.png", "labels.npz")
-_FILES += (COLLIDER_FILE, SCENE_FILE, "report.json")
+_FILES = (
+    "video.mp4", "contact_sheet.png", "objects.png", "labels.npz", COLLIDER_FILE, SCENE_FILE, "report.json",
+)  # fmt: skip
 Progress = Callable[[str, int, int], None]  # stage, done, of
 
 
@@ -105,13 +106,10 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: 
             labels.ids,
             scene=_mark(scene, inputs),
         )
-<<<<<<< HEAD
         io.save_rows(out / "states", rows_of(plan.particles, labels), signature=key)
         store_colliders(out / COLLIDER_FILE, scene, plan.colliders)
         io.write_toml(out / SCENE_FILE, values_of(scene, out))
-=======
         tell("seed", 1, 1)
->>>>>>> main
     _describe(scene, inputs, plan, labels, report)
     states = _simulate(scene, plan, out / "states", parts, key, report, tell)
     if scene.output.states_every == 1:

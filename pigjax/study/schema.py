@@ -16,13 +16,8 @@ from msgspec import field
 from pigjax.core.arguments import checked
 from pigjax.core.checks import LARGEST_WHOLE, Limits, joined, suggest
 from pigjax.core.errors import SceneError
-<<<<<<< HEAD
-from pigjax.scene.decode import Section, decode
-from pigjax.scene.schema import INPUT_FILES, Scene, read_file, scene_from
-=======
 from pigjax.scene.decode import Section, decode, merged
-from pigjax.scene.schema import Scene, read_file, scene_from
->>>>>>> main
+from pigjax.scene.schema import INPUT_FILES, Scene, read_file, scene_from
 
 Value = float | tuple[float, ...]
 MOST_ROWS = 1_000_000  # of a sweep
