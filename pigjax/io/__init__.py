@@ -20,6 +20,7 @@ from pigjax.io.files import (
     remove,
     safe_name,
     safe_names,
+    toml_text,
     write_json,
     write_text,
     write_toml,
@@ -27,7 +28,7 @@ from pigjax.io.files import (
 )
 from pigjax.io.formats import load_gaussians, origin_of, read_gaussians
 from pigjax.io.gltf import Mesh, save_glb, save_mesh
-from pigjax.io.images import contact_sheet, png_bytes, read_image, write_image
+from pigjax.io.images import contact_sheet, data_uri, read_image, write_image
 from pigjax.io.labels import StoredLabels, digest_of_scene, load_labels, save_labels
 from pigjax.io.masks import load_masks, save_masks
 from pigjax.io.page import save_page
@@ -65,6 +66,7 @@ __all__ = [
     "check_same",
     "claim",
     "contact_sheet",
+    "data_uri",
     "decoding",
     "digest",
     "digest_of_scene",
@@ -89,7 +91,6 @@ __all__ = [
     "output_folder",
     "parts_of",
     "plain_label",
-    "png_bytes",
     "read_gaussians",
     "read_image",
     "read_json",
@@ -119,6 +120,7 @@ __all__ = [
     "set_aside",
     "signed",
     "state_frames",
+    "toml_text",
     "write_csv",
     "write_image",
     "write_json",
