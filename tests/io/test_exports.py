@@ -191,6 +191,18 @@ def test_usd_has_a_time_sample_for_each_frame_that_moves(tmp_path, frames):
     np.testing.assert_allclose(back["means"], frames[1].means + jnp.asarray([10.0, 0, 0]), atol=1e-6)
 
 
+def test_usd_that_draws_on_other_files_is_refused(tmp_path, frames):
+    pytest.importorskip("pxr")
+    io.save_usd(tmp_path / "a.usda", [frames[0]])
+    text = "#usda 1.0\n(\n    subLayers = [@./a.usda@]\n)\n"
+    (tmp_path / "b.usda").write_text(text)
+    with pytest.raises(InputError, match=r"b\.usda: draws on other files"):
+        io.load_gaussians(tmp_path / "b.usda")
+    (tmp_path / "c.usdc").write_bytes(b"PXR-USDC" + bytes(80))
+    with pytest.raises(InputError, match=r"c\.usdc: not a readable USD file"):
+        io.load_gaussians(tmp_path / "c.usdc")
+
+
 # ---- the page
 
 
