@@ -10,6 +10,7 @@ from pigjax.core.camera import Camera, interpolate_path, look_at, orbit, stack_c
 from pigjax.core.errors import InputError, MissingFileError, SceneError, SimulationError
 from pigjax.core.metrics import boundary_iou, mean_iou, psnr, ssim
 from pigjax.core.placing import as_gaussians, placed
+from pigjax.core.regions import BoxRegion, HalfSpace, SphereRegion
 from pigjax.coupling.binding import at_frame, bind, deform
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
@@ -31,6 +32,7 @@ from pigjax.mls_mpm import SimConfig, rollout, step
 from pigjax.mpm import Grid, Health, Particles, Trajectory, fit_grid, make_particles, vast_grid
 from pigjax.mpm.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
 from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.forces import Force, ForceField, Impulse, Spring, Wind, grab
 from pigjax.mpm.materials import Material, MaterialTable, material_table, preset
 from pigjax.mpm.sleep import Sleep
 from pigjax.mpm.timestep import choose_integrator, choose_substeps, stable_dt
@@ -61,16 +63,21 @@ __all__ = [
     "BodyContact",
     "Bounds",
     "Box",
+    "BoxRegion",
     "Camera",
     "Capsule",
     "ClampParams",
     "Cylinder",
     "Experiment",
     "FitConfig",
+    "Force",
+    "ForceField",
     "Frame",
     "Gaussians",
     "Grid",
+    "HalfSpace",
     "Health",
+    "Impulse",
     "InputError",
     "Labels",
     "Material",
@@ -88,10 +95,13 @@ __all__ = [
     "SimulationError",
     "Sleep",
     "Sphere",
+    "SphereRegion",
     "Splats",
+    "Spring",
     "Table",
     "Trajectory",
     "Views",
+    "Wind",
     "as_gaussians",
     "associate_masks",
     "at_frame",
@@ -111,6 +121,7 @@ __all__ = [
     "fill_unseen",
     "fit",
     "fit_grid",
+    "grab",
     "hole_mask",
     "interpolate_path",
     "lift_masks",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import time
 from collections.abc import Iterator
@@ -24,6 +25,7 @@ from rich.progress import (
 from rich.text import Text
 
 from pigjax.core.errors import InputError
+from pigjax.io.compile_cache import SWITCH, use_compile_cache
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -77,6 +79,16 @@ def _hush(quiet: bool) -> bool:
     return quiet
 
 
+def _without_cache(no_cache: bool) -> bool:
+    if no_cache:
+        os.environ[SWITCH] = "off"
+    return no_cache
+
+
+NoCache = Annotated[
+    bool,
+    typer.Option("--no-cache", help="Compile everything anew and keep nothing of it.", callback=_without_cache),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors alone.", callback=_hush)]
 
 
@@ -95,6 +107,17 @@ def said(text: object, *, label: str = "", style: str = "") -> Text:
 def row(*cells: object) -> tuple[Text, ...]:
     """Cells of a table, printed literally."""
     return tuple(said(cell) for cell in cells)
+
+
+def prepare_jax() -> None:
+    """Use all cores, keep compiled programs for the next command, and look for garbage less often.
+
+    Tracing makes objects by the million, and hardly any of them is garbage: looking at the default rate slows it down.
+    """
+    one_device_per_core()
+    use_compile_cache()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
 
 
 def one_device_per_core() -> None:

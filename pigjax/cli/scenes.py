@@ -14,14 +14,15 @@ from rich.table import Table
 from pigjax.cli.base import (
     Changes,
     DropInvalid,
+    NoCache,
     Origin,
     Out,
     Overwrite,
     Quiet,
     app,
     console,
-    one_device_per_core,
     output_path,
+    prepare_jax,
     progress,
     row,
     said,
@@ -56,6 +57,7 @@ def demo(
     changes: Changes = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Simulate the bundled tabletop scene and leave a video."""
     _run(example_folder() / "scene.toml", out, accuracy, changes, overwrite=overwrite)
@@ -70,6 +72,7 @@ def run(
     drop_invalid: DropInvalid = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Simulate a scene and draw its video; a killed run goes on from its last frame."""
     _run(scene, out, accuracy, changes, drop_invalid=drop_invalid, overwrite=overwrite)
@@ -84,7 +87,7 @@ def _run(
     drop_invalid: bool = False,
     overwrite: bool = False,
 ) -> None:
-    one_device_per_core()
+    prepare_jax()
     from pigjax.scene import load_scene, run_scene
     from pigjax.scene.decode import settings_from
 
@@ -128,9 +131,10 @@ def view(
     drop_invalid: DropInvalid = False,
     origin: Origin = None,
     quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Draw a file from all around."""
-    one_device_per_core()
+    prepare_jax()
     from pigjax import io
     from pigjax.cli.turntable import turntable
 

@@ -80,7 +80,7 @@ def _series(rows: list[Record], name: str) -> list[float]:
 
 
 def remarks(health: Mapping[str, Any], *, driven: bool) -> list[str]:
-    """Problems, in sentences that name a remedy; `driven` says that colliders move and may do work."""
+    """Problems, in sentences that name a remedy; `driven` says that colliders move, or forces act, and may do work."""
     if not health:
         return []
     found = []
