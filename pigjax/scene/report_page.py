@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pigjax import io
+from pigjax.scene.forces import WindSpec
 from pigjax.scene.report import RunReport
 from pigjax.scene.schema import Scene
 
@@ -83,6 +84,8 @@ def left_out(scene: Scene, report: RunReport) -> list[str]:
         found.append("The inside of objects: they are hollow (simulation.fill).")
     if not any(entry.fixed for entry in scene.objects.values()) and not scene.colliders():
         found.append("Any support: nothing stands in the way of matter (a table of the scene such as planes does).")
+    if not any(isinstance(force, WindSpec) for force in scene.forces.values()):
+        found.append('Air, and its drag (a table forces.NAME with kind = "wind").')
     found.append("Forces of matter on fixed objects and colliders, which stay or move as told.")
     turns = report.modelled.get("sh_coefficients", 1) > 1
     light = "shadows and highlights stay as they were captured" + (", and turn with the matter." if turns else ".")
