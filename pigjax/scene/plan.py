@@ -35,7 +35,7 @@ from pigjax.objects.lifting import lift
 from pigjax.scene.advice import default_dx, remarks_on
 from pigjax.scene.forces import forces_of
 from pigjax.scene.framing import framing_camera
-from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec
+from pigjax.scene.schema import INPUT_FILES, CameraSpec, ClampSpec, Scene, SimulationSpec
 from pigjax.segmentation import Labels, fill_unseen
 from pigjax.splat import Gaussians, RenderConfig
 from pigjax.splatting.types import extent_of
@@ -88,7 +88,7 @@ def read_inputs(scene: Scene) -> Inputs:
     names = {} if spec.names is None else io.load_names(scene.path(spec.names))
     known = {name: _id_of(name, scene, names) for name in scene.objects}
     _check_ids({name: number for name, number in known.items() if number is not None})
-    gaussians = io.load_gaussians(scene.path(spec.gaussians), drop_invalid=spec.drop_invalid, origin=spec.origin)
+    gaussians = read_gaussians(scene)
     views = None
     if spec.views is not None:
         masks = True if spec.masks is None else scene.path(spec.masks)
@@ -120,6 +120,24 @@ def _numbered(
         taken.append(int(stored.object_id.max(initial=0)))
     free = itertools.count(max(taken) + 1)
     return {name: next(free) if number is None else number for name, number in known.items()}
+
+
+def read_gaussians(scene: Scene) -> Gaussians:
+    """Gaussians of the scene at rest, in the frame in which they are simulated.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    spec = scene.input
+    return io.load_gaussians(scene.path(spec.gaussians), drop_invalid=spec.drop_invalid, origin=spec.origin)
+
+
+def to_capture(scene: Scene) -> Float[np.ndarray, "4 4"]:
+    """Transform from the frame of the simulation back to that of the Gaussians' file, less `input.origin`.
+
+    Exports pass through it, so that they lie where the capture does.
+    """
+    return np.eye(4)
 
 
 def _id_of(name: str, scene: Scene, names: dict[int, str]) -> int | None:
@@ -285,19 +303,24 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         sleep=None if spec.sleep is None else Sleep(speed=spec.sleep),
         gravity=vector,
         config=SimConfig(kernel=spec.kernel, cfl=spec.cfl, integrator=spec.integrator),
-        clamp=ClampParams(
-            tau_min=jnp.asarray(scene.clamp.tau_min),
-            tau_max=jnp.asarray(scene.clamp.tau_max),
-            lambda_R=jnp.asarray(scene.clamp.lambda_R),
-            lambda_S=jnp.asarray(scene.clamp.lambda_S),
-            relative=scene.clamp.relative,
-        ),
+        clamp=clamp_params(scene.clamp),
         frame_dt=frame_dt,
         dx=dx,
         pins=scene.pins(),
         starts=tuple(math.ceil(entry.start / frame_dt - 1e-9) for entry in moving.values()),
         remarks=[*lost, *remarks_on(scene, particles, table, vector, dx)],
         labels=labels,
+    )
+
+
+def clamp_params(spec: ClampSpec) -> ClampParams:
+    """Bounds and weights of a scene's eigen-clamp."""
+    return ClampParams(
+        tau_min=jnp.asarray(spec.tau_min),
+        tau_max=jnp.asarray(spec.tau_max),
+        lambda_R=jnp.asarray(spec.lambda_R),
+        lambda_S=jnp.asarray(spec.lambda_S),
+        relative=spec.relative,
     )
 
 
@@ -443,7 +466,7 @@ def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
         settings.pop(name)
     if scene.output.compress_states:
         settings["output"] = {"compress_states": True}
-    for name in ("gaussians", "views", "masks", "labels", "names"):
+    for name in INPUT_FILES:
         settings["input"].pop(name)
     views = inputs.views
     content = {
