@@ -25,6 +25,10 @@ Overwrite = Annotated[
 DropInvalid = Annotated[
     bool, typer.Option("--drop-invalid", help="Leave out Gaussians that hold NaN or infinity, with a warning.")
 ]
+Images = Annotated[
+    Path | None,
+    typer.Option("--images", metavar="DIR", help="Folder of the photos, if not the one that the cameras' file names."),
+]
 Origin = Annotated[
     tuple[float, float, float] | None,
     typer.Option("--origin", metavar="X Y Z", help="Subtract this point, for georeferenced files [m]."),

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from pigjax.cli.base import (
     DropInvalid,
+    Images,
     Origin,
     Out,
     Overwrite,
@@ -53,6 +54,7 @@ def reconstruct(
     sh_degree: Annotated[int, typer.Option(help="Bands of view-dependent colour.", min=0, max=3)] = 1,
     background: Annotated[float, typer.Option(help="Grey level behind the scene: 0 black, 1 white.")] = 0.0,
     max_size: Annotated[int | None, typer.Option(help="Shrink photos to this many pixels.")] = None,
+    images: Images = None,
     start_splats: Annotated[
         int | None, typer.Option(help="Begin with fewer Gaussians and double them during the first half.", min=4)
     ] = None,
@@ -75,7 +77,9 @@ def reconstruct(
 
     needs_masks = only is not None or random_background
     doublings = max(math.ceil(math.log2(splats / start_splats)), 1) if start_splats else 1
-    loaded = io.load_views(views, masks=needs_masks, max_size=max_size, background=background, origin=origin)
+    loaded = io.load_views(
+        views, images=images, masks=needs_masks, max_size=max_size, background=background, origin=origin
+    )
     points = io.load_points(loaded.points_path, origin=origin) if loaded.points_path else None
     config = FitConfig(
         steps=steps,
@@ -147,6 +151,7 @@ def segment(
     gaussians: Annotated[Path, typer.Argument(help="Trained .ply, .splat or .spz.")],
     views: Annotated[Path, typer.Argument(help="Posed photos with a folder object_mask beside them.")],
     out: Out = Path("segments"),
+    images: Images = None,
     masks: Annotated[Path | None, typer.Option(help="Folder of masks, if it lies elsewhere.")] = None,
     names: Annotated[Path | None, typer.Option(help="JSON of mask ids and names.")] = None,
     tau_t: TauT = 0.5,
@@ -168,7 +173,7 @@ def segment(
     from pigjax.cli.segmenting import segment_files
 
     cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid, origin=origin)
-    loaded = io.load_views(views, masks=masks if masks is not None else True, origin=origin)
+    loaded = io.load_views(views, images=images, masks=masks if masks is not None else True, origin=origin)
     known = {} if names is None else io.load_names(names)
     settings = _settings(tau_t, tau_d, weighting, purity, min_seen)
     counts = segment_files(
@@ -187,6 +192,7 @@ def evaluate(
     gaussians: Annotated[Path, typer.Argument(help="Trained .ply, .splat or .spz of it.")],
     layout: Annotated[str, typer.Option("--format", help="lerf-mask, 3d-ovs, or views.")],
     out: Out = Path("evaluation"),
+    images: Images = None,
     masks: Annotated[Path | None, typer.Option(help="Folder or JSON of the masks to lift, if not object_mask.")] = None,
     labels: Annotated[Path | None, typer.Option(help="labels.npz of 'pigjax segment', instead of lifting.")] = None,
     prompts: Annotated[Path | None, typer.Option(help="JSON {prompt: id}.")] = None,
@@ -209,7 +215,7 @@ def evaluate(
 
     cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid, origin=origin)
     read = io.load_dataset(
-        dataset, layout, masks=masks, vote=labels is None, max_size=max_size, holes=holes, origin=origin
+        dataset, layout, images=images, masks=masks, vote=labels is None, max_size=max_size, holes=holes, origin=origin
     )
     with progress() as bar:
         tasks: dict[str, TaskID] = {}

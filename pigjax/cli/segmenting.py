@@ -77,7 +77,7 @@ def segment_files(
             "Gaussians": io.digest(gaussians),
             "cameras": io.digest(views.cameras),
             "photos": io.digest(views.images, views.names, views.splits),
-            "masks": io.digest(views.masks),
+            "masks": io.digest(views.masks) if views.valid is None else io.digest(views.masks, views.valid),
             "names": io.digest(names),
             "": {**settings, "fill": fill, "origin": origin},
         }
@@ -87,7 +87,7 @@ def segment_files(
     io.output_folder(out / "objects")
     train = views.training
     assert train.masks is not None
-    labels = lift(gaussians, train.cameras, train.masks, fill=fill, **settings)
+    labels = lift(gaussians, train.cameras, train.masks, fill=fill, valid=train.valid, **settings)
     object_id = np.asarray(labels.object_id)
     mark = io.digest_of_scene(gaussians) if origin is None else None  # else positions are not those of the file
     io.save_labels(out / "labels.npz", object_id, labels.votes, labels.confidence, labels.ids, scene=mark)

@@ -75,7 +75,10 @@ def read_inputs(scene: Scene) -> Inputs:
     views = None
     if spec.views is not None:
         masks = True if spec.masks is None else scene.path(spec.masks)
-        views = io.load_views(scene.path(spec.views), masks=masks, max_size=spec.max_size, origin=spec.origin)
+        photos = None if spec.images is None else scene.path(spec.images)
+        views = io.load_views(
+            scene.path(spec.views), images=photos, masks=masks, max_size=spec.max_size, origin=spec.origin
+        )
     if scene.camera.view is not None:
         _camera_of_view(scene.camera, views)
     return Inputs(gaussians, views, ids, names)
@@ -124,6 +127,7 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
         tau_T=spec.tau_T,
         tau_d=spec.tau_d,
         background=spec.background,
+        valid=views.valid,
     )
     found = np.unique(np.maximum(labels.object_id, 0))
     for name, number in inputs.ids.items():
@@ -317,14 +321,14 @@ def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
     settings: dict[str, Any] = msgspec.to_builtins(scene)
     for name in ("accuracy", "camera", "clamp", "drawing", "folder"):
         settings.pop(name)
-    for name in ("gaussians", "views", "masks", "names"):
+    for name in ("gaussians", "views", "images", "masks", "names"):
         settings["input"].pop(name)
     views = inputs.views
     content = {
         "Gaussians": inputs.gaussians,
         "cameras": None if views is None else views.cameras,
         "photos": None if views is None else (views.images, views.names, views.splits),
-        "masks": None if views is None else views.masks,
+        "masks": None if views is None else views.masks if views.valid is None else (views.masks, views.valid),
         "ids of the objects": inputs.ids,
     }
     digests = {name: io.digest(value) for name, value in content.items()}

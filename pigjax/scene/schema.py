@@ -38,6 +38,7 @@ class InputSpec(Section, frozen=True):
 
     gaussians: str  # trained .ply
     views: str | None = None  # posed photos, which the masks belong to
+    images: str | None = None  # folder of the photos, where it is not the one that the cameras' file names
     masks: str | None = None  # folder of instance masks; None: `object_mask` beside the photos
     names: str | None = None  # JSON of mask ids and names
     max_size: Annotated[int, Limits(1, 65536, unit="px")] | None = None  # of the photos' longer side
@@ -48,6 +49,7 @@ class InputSpec(Section, frozen=True):
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """Masks belong to views."""
         yield "masks", self.masks is None or self.views is not None, "masks belong to photos; give input.views, too"
+        yield "images", self.images is None or self.views is not None, "photos have cameras; give input.views, too"
 
 
 class SegmentationSpec(Section, frozen=True):
