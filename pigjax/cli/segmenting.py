@@ -16,6 +16,7 @@ from pigjax import io
 from pigjax.core.checks import suggest
 from pigjax.core.errors import InputError
 from pigjax.core.gaussians import SH_CONSTANT
+from pigjax.core.harmonics import sh_degree_of
 from pigjax.io.files import existing
 from pigjax.objects.editing import extract_object, hole_mask, remove_object
 from pigjax.objects.lifting import lift
@@ -24,7 +25,6 @@ from pigjax.reconstruction.prune import contributions
 from pigjax.scene.schema import load_scene
 from pigjax.segmentation import Labels, pixel_ids
 from pigjax.splat import Gaussians, render
-from pigjax.splatting.sh import sh_degree_of
 from pigjax.splatting.types import extent_of
 
 _SHEET_VIEWS = 4

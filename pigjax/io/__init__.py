@@ -26,29 +26,37 @@ from pigjax.io.files import (
     writing,
 )
 from pigjax.io.formats import load_gaussians, origin_of, read_gaussians
-from pigjax.io.images import contact_sheet, read_image, write_image
+from pigjax.io.gltf import Mesh, save_glb, save_mesh
+from pigjax.io.images import contact_sheet, png_bytes, read_image, write_image
 from pigjax.io.labels import StoredLabels, digest_of_scene, load_labels, save_labels
 from pigjax.io.masks import load_masks, save_masks
+from pigjax.io.page import save_page
 from pigjax.io.ply import load_ply, load_points, read_ply, save_ply
+from pigjax.io.points import save_points
 from pigjax.io.provenance import check_same, claim, digest, file_digest, parts_of
 from pigjax.io.state import (
     STATES,
     last_state,
     load_pytree,
+    load_rows,
     load_state,
     readable_states,
     resumed,
     save_pytree,
+    save_rows,
     save_state,
     set_aside,
     signed,
+    state_frames,
 )
+from pigjax.io.usd import read_usd, save_usd
 from pigjax.io.video import read_video, write_video
 
 __all__ = [
     "LAYOUTS",
     "STATES",
     "Dataset",
+    "Mesh",
     "StoredLabels",
     "Views",
     "check_same",
@@ -71,17 +79,20 @@ __all__ = [
     "load_ply",
     "load_points",
     "load_pytree",
+    "load_rows",
     "load_state",
     "load_views",
     "origin_of",
     "output_folder",
     "parts_of",
     "plain_label",
+    "png_bytes",
     "read_gaussians",
     "read_image",
     "read_json",
     "read_ply",
     "read_toml",
+    "read_usd",
     "read_video",
     "readable_states",
     "remove",
@@ -90,13 +101,20 @@ __all__ = [
     "safe_names",
     "save_arrays",
     "save_figure",
+    "save_glb",
     "save_labels",
     "save_masks",
+    "save_mesh",
+    "save_page",
     "save_ply",
+    "save_points",
     "save_pytree",
+    "save_rows",
     "save_state",
+    "save_usd",
     "set_aside",
     "signed",
+    "state_frames",
     "write_csv",
     "write_image",
     "write_json",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -183,6 +184,17 @@ def write_image(path: PathLike, image: Picture) -> None:
             pixels.save(partial)
         except ValueError as error:
             raise InputError(f"{path}: {error}; use a suffix such as .png or .jpg.") from None
+
+
+def png_bytes(image: Picture) -> bytes:
+    """A picture in RGB, RGBA or grey as the bytes of a `.png`, to lie within a page.
+
+    Raises:
+        InputError: the array is no picture.
+    """
+    room = io.BytesIO()
+    Image.fromarray(to_uint8(image)).save(room, "png")
+    return room.getvalue()
 
 
 @checked
