@@ -61,15 +61,16 @@ def ssim(
     Args:
         a: an image.
         b: the other.
-        valid: pixels that count, the same for all channels; the images are taken to be equal in all others, which
-            windows at their rim see. None: all count.
+        valid: pixels that count, the same for all channels; all others are zeros in both images, as beyond the edge.
+            None: all count.
 
     Raises:
         InputError: the images differ in shape, or hold integers.
     """
     _check_pair(a, b)
     if valid is not None:
-        a = jnp.where(valid.reshape(*valid.shape, *[1] * (a.ndim - 2)), a, b)
+        inside = valid.reshape(*valid.shape, *[1] * (a.ndim - 2))
+        a, b = jnp.where(inside, a, 0.0), jnp.where(inside, b, 0.0)
     a, b = (jnp.moveaxis(jnp.atleast_3d(v), -1, 0) for v in (a, b))
     mean_a, mean_b, squares, product = _blur(jnp.stack([a, b, a * a + b * b, a * b]))
     mean_squares, mean_product = mean_a * mean_a + mean_b * mean_b, mean_a * mean_b

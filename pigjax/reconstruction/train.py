@@ -207,7 +207,7 @@ def _loss(fitted, camera: Camera, photo: Photos, background, config: FitConfig, 
     image = photo.images if photo.mattes is None else photo.images + (1 - photo.mattes) * background
     rgb = frame.rgb
     if photo.valid is not None:
-        rgb = jnp.where(photo.valid[..., None], rgb, image)
+        rgb, image = (jnp.where(photo.valid[..., None], picture, 0.0) for picture in (rgb, image))
     loss = (1 - config.ssim_weight) * jnp.mean(jnp.abs(rgb - image))
     if config.ssim_weight:
         loss += config.ssim_weight * (1 - ssim(rgb, image))

@@ -16,7 +16,8 @@ from pigjax import io
 from pigjax.clamp import ClampParams
 from pigjax.core.camera import Camera, orbit, stack_cameras
 from pigjax.core.checks import suggest
-from pigjax.core.errors import InputError, SceneError
+from pigjax.core.errors import SceneError
+from pigjax.core.placing import placed
 from pigjax.coupling.binding import Binding, bind
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
@@ -28,6 +29,7 @@ from pigjax.mpm.materials import Material, MaterialTable
 from pigjax.mpm.sleep import Sleep
 from pigjax.objects.lifting import lift
 from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec
+from pigjax.scene.world import WorldSpec, axis_of, file_to_world, height_of, metres_of, placed_cameras
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, RenderConfig
 from pigjax.splatting.types import extent_of
@@ -41,6 +43,8 @@ class Inputs:
     views: io.Views | None
     ids: dict[str, int]  # id of each object of the scene
     names: dict[int, str]  # names that `input.names` gives to ids
+    world: Float[np.ndarray, "4 4"] | None = None  # transform from the files; None: none
+    labels: Labels | None = None  # where the scale of the world needed them
 
 
 @dataclass
@@ -81,7 +85,7 @@ def read_inputs(scene: Scene) -> Inputs:
         )
     if scene.camera.view is not None:
         _camera_of_view(scene.camera, views)
-    return Inputs(gaussians, views, ids, names)
+    return _placed_inputs(scene, Inputs(gaussians, views, ids, names))
 
 
 def _id_of(name: str, scene: Scene, names: dict[int, str]) -> int:
@@ -109,6 +113,8 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
     Raises:
         SceneError: no Gaussian belongs to an object.
     """
+    if inputs.labels is not None:
+        return inputs.labels
     spec = scene.segmentation
     if inputs.views is None:
         (only,) = inputs.ids.values()
@@ -245,17 +251,6 @@ def _without_buried(inputs: Inputs, labels: Labels, solids: dict[str, Collider],
     return labels
 
 
-def axis_of(name: str) -> Float[np.ndarray, "3"]:
-    """Unit vector of an axis by its name, "-y".
-
-    Raises:
-        InputError: it has another name.
-    """
-    if name.removeprefix("-") not in ("x", "y", "z"):
-        raise InputError(f"up = {name!r}: choose one of x, y, z, -x, -y, -z.")
-    return np.eye(3)["xyz".index(name[-1])] * (-1 if name.startswith("-") else 1)
-
-
 def make_cameras(scene: Scene, inputs: Inputs, focus: Float[np.ndarray, "3"]) -> Camera:
     """Batch of one camera for each frame of the video.
 
@@ -333,3 +328,34 @@ def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
     }
     digests = {name: io.digest(value) for name, value in content.items()}
     return io.parts_of({"": settings, "input files": digests, "precision": str(jnp.result_type(float))})
+
+
+def _placed_inputs(scene: Scene, inputs: Inputs) -> Inputs:
+    """The inputs in metres with z up, as the scene's `[world]` and the heights of its objects say.
+
+    Raises:
+        SceneError: nothing tells which way is up, or an object has no height.
+    """
+    tall = {name: spec.height for name, spec in scene.objects.items() if spec.height is not None}
+    if scene.world == WorldSpec() and not tall:
+        return inputs
+    gaussians, views = inputs.gaussians, inputs.views
+    matrix = file_to_world(scene.world, scene.input.up, gaussians, None if views is None else views.cameras)
+    inputs = _moved(inputs, gaussians, views, matrix)
+    for name, text in tall.items():
+        labels = segment(scene, inputs)
+        mine = np.flatnonzero(np.asarray(labels.object_id) == inputs.ids[name])
+        found = height_of(inputs.gaussians, mine, axis_of(scene.input.up))
+        if not found > 0:
+            raise SceneError(f"objects.{name}.height: its {len(mine)} Gaussians have no height; remove the field.")
+        matrix = np.dot(np.diag([*[metres_of(text, f"objects.{name}.height") / found] * 3, 1.0]), matrix)
+        inputs = _moved(inputs, gaussians, views, matrix)
+        inputs.labels = labels  # votes do not depend on units
+    return inputs
+
+
+def _moved(inputs: Inputs, gaussians: Gaussians, views: io.Views | None, matrix: Float[np.ndarray, "4 4"]) -> Inputs:
+    """The inputs with Gaussians and cameras of the files, moved."""
+    if views is not None:
+        views = replace(views, cameras=placed_cameras(views.cameras, matrix))
+    return replace(inputs, gaussians=placed(gaussians, matrix), views=views, world=matrix)

@@ -29,6 +29,7 @@ from pigjax.scene.health import MARK, Record, health_record, remarks, summary
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
 from pigjax.scene.report import RunReport
 from pigjax.scene.schema import Scene
+from pigjax.scene.world import described
 from pigjax.segmentation import Labels, pixel_ids
 from pigjax.splat import Gaussians, render
 
@@ -108,8 +109,9 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: 
 
 
 def _mark(scene: Scene, inputs: Inputs) -> str | None:
-    """Digest of the Gaussians that labels belong to; None where an origin was subtracted from their positions."""
-    return None if scene.input.origin is not None else io.digest_of_scene(inputs.gaussians)
+    """Digest of the Gaussians that labels belong to; None where they are not as in the file."""
+    moved = scene.input.origin is not None or inputs.world is not None
+    return None if moved else io.digest_of_scene(inputs.gaussians)
 
 
 def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: RunReport) -> None:
@@ -127,6 +129,8 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
         "sleep": plan.sleep is not None,
         "sh_coefficients": inputs.gaussians.sh.shape[1],
     }
+    if inputs.world is not None:
+        report.modelled["world"] = described(inputs.world)
     report.sizes |= {
         "gaussians": len(inputs.gaussians),
         "gaussians_of": {names.get(k, f"id {k}"): int(np.sum(object_id == k)) for k in np.unique(object_id)},

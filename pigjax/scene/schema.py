@@ -20,6 +20,7 @@ from pigjax.mpm.contact import broken_by
 from pigjax.mpm.materials import LAWS, PRESETS, Material, Parameters
 from pigjax.scene.accuracy import LEVELS, Accuracy, with_level
 from pigjax.scene.decode import Section, decode
+from pigjax.scene.world import WorldSpec, axis_of, metres_of
 from pigjax.splatting.types import RenderConfig
 
 Triple = tuple[float, float, float]
@@ -44,7 +45,8 @@ class InputSpec(Section, frozen=True):
     max_size: Annotated[int, Limits(1, 65536, unit="px")] | None = None  # of the photos' longer side
     drop_invalid: bool = False  # leave out Gaussians with NaN or infinity instead of refusing the file
     origin: Triple | None = None  # subtracted from Gaussians and cameras in float64, for georeferenced files [m]
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"  # axis of the world that points up
+    # axis or direction of the world that points up; nothing is turned (`world.up` turns)
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | Triple = "z"
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """Masks belong to views."""
@@ -134,6 +136,7 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     """
 
     id: Annotated[int, Limits(0, 2**31 - 1)] | None = None  # in the masks; None: looked up by the object's name
+    height: str | None = None  # its true height with a unit, as "0.6 m": gives the scale of the whole scene
     fixed: bool = False  # a still collider made from its own splats
     friction: Annotated[float, _FRICTION] = 0.5  # Coulomb's coefficient of a fixed object
     material: str | None = None
@@ -257,6 +260,7 @@ class Scene(Section, frozen=True):
     input: InputSpec  # files
     simulation: SimulationSpec  # grid, frames, gravity
     objects: dict[str, ObjectSpec]  # by name
+    world: WorldSpec = WorldSpec()  # axes and units of the files
     segmentation: SegmentationSpec = SegmentationSpec()  # thresholds of the vote
     clamp: ClampSpec = ClampSpec()  # bounds and weights of the eigen-clamp
     camera: CameraSpec = CameraSpec()  # of the video
@@ -282,6 +286,13 @@ class Scene(Section, frozen=True):
         has_views = self.input.views is not None
         yield "input.views", has_views or len(self.objects) == 1, "several objects need photos with masks; give them"
         yield "camera.view", has_views or self.camera.view is None, "photos have cameras; give input.views, or an orbit"
+        tall = [name for name, spec in self.objects.items() if spec.height is not None]
+        known = self.world.units_per_metre is None
+        yield joined("objects", *tall[:1], "height"), known or not tall, "world.units_per_metre is given; remove one"
+        yield joined("objects", *tall[1:2], "height"), len(tall) < 2, f"objects.{joined(*tall[:1])} has one; remove one"
+        up = self.input.up
+        rule = "world.up turns the scene so that z points up; remove input.up"
+        yield "input.up", self.world.up is None or up == "z", rule
         in_contact = moving > 1 and self.simulation.contact_friction is not None
         broken = broken_by(self.simulation.integrator) if in_contact else None
         yield "simulation.integrator", broken is None, f"{broken}, or remove simulation.contact_friction"
@@ -344,6 +355,15 @@ def read_file(path: Path, what: str) -> dict[str, Any]:
         raise SceneError(str(error)) from error
 
 
+def _check_up(scene: Scene) -> None:
+    for section, up in (("input", scene.input.up), ("world", scene.world.up)):
+        if up is not None and up != "auto":
+            try:
+                axis_of(up)
+            except InputError as error:
+                raise SceneError(f"{section}.{error}") from None
+
+
 def scene_from(
     values: dict[str, Any], *, folder: str | Path = ".", where: str = "scene", accuracy: str | None = None
 ) -> Scene:
@@ -364,6 +384,9 @@ def scene_from(
         for name, spec in scene.objects.items():
             if not spec.fixed:
                 spec.to_material(name)
+            if spec.height is not None:
+                metres_of(spec.height, joined("objects", name, "height"))
+        _check_up(scene)
         scene.colliders()
     except SceneError as error:
         raise SceneError(f"{where}: {error}") from error.__cause__
