@@ -29,17 +29,18 @@ from pigjax.scene.advice import plan_line
 from pigjax.scene.arrangement import arrange
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
-from pigjax.scene.replay import COLLIDER_FILE, SCENE_FILE, rows_of, store_colliders
+from pigjax.scene.replay import COLLIDER_FILE, REST_FILE, SCENE_FILE, rows_of, store_colliders, store_rest
 from pigjax.scene.report import RunReport
 from pigjax.scene.report_page import report_page
 from pigjax.scene.schema import Scene, values_of
 from pigjax.scene.stages import simulate_stages, stages_of
+from pigjax.scene.world import described
 from pigjax.segmentation import Labels, pixel_ids
 from pigjax.splat import Gaussians, render
 
 _SHEET_FRAMES = 12
 _FILES = (
-    "video.mp4", "contact_sheet.png", "objects.png", "labels.npz", COLLIDER_FILE, SCENE_FILE, "report.json",
+    "video.mp4", "contact_sheet.png", "objects.png", "labels.npz", COLLIDER_FILE, REST_FILE, SCENE_FILE, "report.json",
     "report.html",
 )  # fmt: skip
 Progress = Callable[[str, int, int], None]  # stage, done, of
@@ -125,6 +126,7 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, say: Say, o
         )
         io.save_rows(out / "states", rows_of(plan.particles, labels), signature=key)
         store_colliders(out / COLLIDER_FILE, scene, plan.colliders)
+        store_rest(out / REST_FILE, inputs, plan.dx)
         io.write_toml(out / SCENE_FILE, values_of(scene, out))
         tell("seed", 1, 1)
     _describe(scene, inputs, plan, labels, report)
@@ -141,8 +143,8 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, say: Say, o
 
 
 def _mark(scene: Scene, inputs: Inputs) -> str | None:
-    """Digest of the Gaussians that labels belong to; None where their positions are not those of the file."""
-    moved = scene.input.origin is not None or any(entry.is_placed for entry in scene.objects.values())
+    """Digest of the Gaussians that labels belong to; None where they are not as in the file."""
+    moved = scene.input.origin is not None or inputs.moved
     return None if moved else io.digest_of_scene(inputs.gaussians)
 
 
@@ -163,6 +165,8 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
         "pins": len(plan.pins),
         "sh_coefficients": inputs.gaussians.sh.shape[1],
     }
+    if inputs.world is not None:
+        report.modelled["world"] = described(inputs.world)
     report.sizes |= {
         "gaussians": len(inputs.gaussians),
         "gaussians_of": {names.get(k, f"id {k}"): int(np.sum(object_id == k)) for k in np.unique(object_id)},
