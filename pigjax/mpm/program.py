@@ -15,6 +15,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.arrays import everywhere, in_precision
+from pigjax.core.backend import takes_warp
 from pigjax.core.errors import InputError
 from pigjax.mpm import (
     Grid,
@@ -141,6 +142,8 @@ def run_frames(
         krylov_steps=config.krylov_steps,
         axis=_AXIS if devices > 1 else None,
         fillers=sum(-len(part) % devices for part, moves in zip(grouping.parts, grouping.moves) if moves),
+        warp=takes_warp(config.backend, config.differentiation),
+        in_order=config.deterministic,
     )
     run = partial(_frames, statics, config, frames, inputs.substeps, of or frames)
     if devices > 1:
@@ -177,7 +180,7 @@ def _frames(
 
     def frame(carry, _):
         states, worst, steps, stopped = carry
-        chunks = tuple(to_chunks(state, config.chunk) for state in states)
+        chunks = tuple(to_chunks(state, len(state.cells) if statics.warp else config.chunk) for state in states)
         chunks, health = steps_of_frame(statics, substeps, of, context, start, chunks, steps)
         steps = steps + substeps
         moved = tuple(
