@@ -116,6 +116,20 @@ def launcher(kernel: Any, name: str, outputs: int, in_out: tuple[str, ...] = ())
     return launch
 
 
+def caller(function: Any, name: str, outputs: int, in_out: tuple[str, ...] = ()) -> Any:
+    """A function of Warp arrays, which launches on the host, as a function of JAX arrays; as `launcher` otherwise."""
+    warp = import_warp()
+    function.__qualname__ = f"pigjax_{name}"
+    mode = warp.JaxCallableGraphMode.NONE
+    call = warp.jax_callable(function, num_outputs=outputs, graph_mode=mode, in_out_argnames=list(in_out))
+
+    def run(*arrays: Any, **sizes: Any) -> Any:
+        call.call_id = 0
+        return call(*arrays, **sizes)
+
+    return run
+
+
 def _fault_of_installation() -> str | None:
     """What is missing to import Warp; None: nothing."""
     if importlib.util.find_spec("warp") is None:
