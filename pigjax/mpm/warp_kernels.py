@@ -1,9 +1,12 @@
+# mypy: ignore-errors
 """Warp kernels of the transfers: P2G and G2P over whole arrays of particles, and the adjoints of both.
 
 One thread a particle, and one 16-byte atomic a node where the chip has it (compute capability 9.0 on). The kernels are
 built on first use, for a B-spline and a precision. Every array has a leading axis of simulations, so that a `vmap` is
 one launch. A launch takes its sizes from the shapes of its arrays, never from numbers of Python: those are no part of
 the key by which JAX keeps compiled programs on disk.
+
+Kernels are in Warp's language, in which annotations are calls.
 """
 
 import functools

@@ -51,7 +51,7 @@ def composite_by_warp(
     settings = _settings(tau, config, table.dtype)
 
     def visit(lists, state):
-        through, surface, *planes = state[0][None], *state[1:]
+        through, surface, planes = state[0][None], state[1], list(state[2:])
         after, picked = through, surface
         for g, rows in enumerate(groups):
             after, planes[g], picked = _kernels(rows).forward(through, planes[g], surface, rows, *_of(lists), *settings)
@@ -156,7 +156,7 @@ def _settings(tau: Float[Array, ""], config: BlendConfig, dtype: Any) -> tuple[F
     return limits[None], jnp.asarray([[config.columns, config.tile]], jnp.int32)
 
 
-def _packed(table: Float[Array, "n f"], config: BlendConfig) -> list[Float[Array, "1 n q 4"]]:
+def _packed(table: Float[Array, "n f"], config: BlendConfig) -> list[Float[Array, "1 n _ 4"]]:
     """Rows of groups of channels, each with the shape; a splat's depth stands with the shape of the first group."""
     count = len(table)
     channels = table[:, SHAPE_COLUMNS : table.shape[1] - config.surface]
@@ -181,7 +181,7 @@ def _shapes(table: Float[Array, "n f"], depth: Float[Array, "n 1"]) -> Float[Arr
 
 
 def _unpacked(
-    groups: list[Float[Array, "1 n q 4"]], table: Float[Array, "n f"], config: BlendConfig
+    groups: list[Float[Array, "1 n _ 4"]], table: Float[Array, "n f"], config: BlendConfig
 ) -> Float[Array, "n f"]:
     """The transpose of `_packed`."""
     flat = [rows[0].reshape(len(table), -1) for rows in groups]

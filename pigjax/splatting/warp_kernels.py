@@ -1,9 +1,12 @@
-# ruff: noqa: RUF046, UP018 - int(0) declares a variable of Warp, 0 a constant
+# mypy: ignore-errors
+# ruff: noqa: RUF046, UP018
 """Warp kernels of the rasterizer: slots of the lists of tiles, their sort, blending, its adjoint, and credits.
 
 One thread a pixel and one block of 256 a tile of 16 x 16; every thread of a tile walks the list of its tile. The
 gradient of a splat is summed over a warp by shuffles before the atomics. Every array has a leading axis of images, so
 that many cameras are one launch. As in `mpm.warp_kernels`, a launch takes its sizes from the shapes of its arrays.
+
+Kernels are in Warp's language: annotations are calls, and int(0) declares a variable where 0 is a constant.
 """
 
 import functools
