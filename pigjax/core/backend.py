@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import importlib.metadata
 import importlib.util
+import os
 import sys
 from typing import Any
 
@@ -17,6 +18,7 @@ from pigjax.core.errors import InputError
 
 BACKENDS = ("auto", "xla", "warp")
 _LEAST = (1, 16)  # of warp-lang: from it on, its kernels run under JAX on CPUs too
+_ORDERED = ("--xla_gpu_deterministic_ops", "--xla_gpu_exclude_nondeterministic_ops")
 _REMEDY = "pip install 'pigjax[gpu]'"
 
 
@@ -64,6 +66,23 @@ def takes_warp(choice: str, differentiation: str) -> bool:
             ' take backend = "xla" or "auto".'
         )
     return True
+
+
+def check_order(warp: bool) -> None:
+    """Refuse sums in a fixed order where XLA adds in any.
+
+    Args:
+        warp: whether the sums are Warp kernels, which have a fixed order if asked for.
+
+    Raises:
+        InputError: XLA scatters by atomics on the default device.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if not warp and jax.default_backend() == "gpu" and not any(flag in flags for flag in _ORDERED):
+        raise InputError(
+            "SimConfig.deterministic = True: XLA adds in any order on a GPU; take backend = 'warp', or set"
+            f" XLA_FLAGS={_ORDERED[0]}=true before JAX starts."
+        )
 
 
 def backend_in_use() -> str:

@@ -15,7 +15,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.arrays import everywhere, in_precision
-from pigjax.core.backend import takes_warp
+from pigjax.core.backend import check_order, takes_warp
 from pigjax.core.errors import InputError
 from pigjax.mpm import (
     Grid,
@@ -101,10 +101,13 @@ def run_frames(
             None: these are all.
 
     Raises:
-        InputError: the integrator is "auto".
+        InputError: the integrator is "auto", or the backend cannot do what the configuration asks for.
     """
     if config.integrator == "auto":
         raise InputError("SimConfig.integrator = 'auto' is undecided: take what choose_integrator finds.")
+    warp = takes_warp(config.backend, config.differentiation)
+    if config.deterministic:
+        check_order(warp)
     kernel, dtype = KERNELS[config.kernel], particles.x.dtype
     window, table, inputs = in_precision((window, table, inputs), dtype)
     grid, contact = window.grid, inputs.contact
@@ -142,7 +145,7 @@ def run_frames(
         krylov_steps=config.krylov_steps,
         axis=_AXIS if devices > 1 else None,
         fillers=sum(-len(part) % devices for part, moves in zip(grouping.parts, grouping.moves) if moves),
-        warp=takes_warp(config.backend, config.differentiation),
+        warp=warp,
         in_order=config.deterministic,
     )
     run = partial(_frames, statics, config, frames, inputs.substeps, of or frames)

@@ -148,33 +148,43 @@ def simulated(backend, laws, *, frames=2, contact=None, gradient=False, **config
     return jax.grad(lambda *a: sum((jnp.sin(3 * part) ** 2).sum() for part in run(*a)[:3]), (0, 1))(v, young)
 
 
+ALL = tuple(law for law, kind in LAWS.items() if kind.respond is not None)
+
+
 @needs_warp
-def test_all_laws_step_as_under_xla():
-    laws = [law for law, kind in LAWS.items() if kind.respond is not None]
-    ours, oracle = (simulated(name, laws, frames=1, substeps=2) for name in ("warp", "xla"))
+@pytest.mark.parametrize(
+    "laws", [("von_mises", "fluid"), pytest.param(ALL, marks=pytest.mark.slow)], ids=["two laws", "all laws"]
+)
+def test_laws_step_as_under_xla(laws):
+    ours, oracle = (simulated(name, laws, frames=1) for name in ("warp", "xla"))
     check_equal(ours, oracle, 2e-6)
 
 
 @needs_warp
 @pytest.mark.parametrize(
     "config",
-    [{"contact": BodyContact(bodies=2)}, {"box": (10, 10, 10), "kernel": "cubic", "deterministic": True}],
-    ids=["bodies in contact", "cubic in a moving box, in order"],
+    [
+        {"contact": BodyContact(bodies=2), "deterministic": True},
+        pytest.param({"box": (10, 10, 10), "kernel": "cubic", "frames": 2}, marks=pytest.mark.slow),
+    ],
+    ids=["bodies in contact, in order", "cubic in a moving box"],
 )
 def test_gradients_of_rollouts_are_those_of_xla(config):
-    ours, oracle = (simulated(name, ["neo_hookean"], gradient=True, **config) for name in ("warp", "xla"))
+    settings = {"frames": 1} | config
+    ours, oracle = (simulated(name, ("neo_hookean",), gradient=True, **settings) for name in ("warp", "xla"))
     check_equal(ours[0], oracle[0], 1e-5)
     check_equal(ours[1], oracle[1], 1e-3)  # a sum over particles that cancels to a thousandth of its terms
 
 
 @needs_warp
 def test_devices_share_the_particles(two_devices):
-    check_equal(simulated("warp", ["neo_hookean"], devices=2), simulated("xla", ["neo_hookean"]), 2e-6)
+    check_equal(simulated("warp", ("neo_hookean",), devices=2), simulated("xla", ("neo_hookean",)), 2e-6)
 
 
 @needs_warp
+@pytest.mark.slow
 def test_implicit_steps_transfer_by_warp_too():
-    ours, oracle = (simulated(name, ["neo_hookean"], integrator="implicit") for name in ("warp", "xla"))
+    ours, oracle = (simulated(name, ("neo_hookean",), integrator="implicit") for name in ("warp", "xla"))
     check_equal(ours, oracle, 1e-5)
 
 
@@ -183,6 +193,15 @@ def test_a_machine_without_a_gpu_takes_xla():
         assert not backend.takes_warp("auto", "reverse")
         assert backend.backend_in_use().startswith("xla on ")
     assert not backend.takes_warp("xla", "reverse")
+
+
+def test_a_fixed_order_is_refused_where_xla_has_none(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    backend.check_order(warp=True)
+    with pytest.raises(InputError, match=r"SimConfig\.deterministic = True: .*backend = 'warp'"):
+        backend.check_order(warp=False)
+    monkeypatch.setenv("XLA_FLAGS", "--xla_gpu_deterministic_ops=true")
+    backend.check_order(warp=False)
 
 
 def test_warp_asked_for_in_vain_is_told(monkeypatch):
