@@ -6,7 +6,7 @@ Pipeline: files (`io`) → Gaussians (`reconstruction`, or a trained file) → o
 """
 
 from pigjax.clamp import ClampParams, eigen_clamp
-from pigjax.core import __version__
+from pigjax.core import __version__ as __version__
 from pigjax.core.camera import Camera, interpolate_path, look_at, orbit, stack_cameras
 from pigjax.core.errors import InputError, MissingFileError, SceneError, SimulationError
 from pigjax.core.metrics import boundary_iou, mean_iou, psnr, ssim
