@@ -1,4 +1,4 @@
-"""Objects of a scene where its file puts them: moved, turned, scaled, copied, or read from files of their own."""
+"""Objects of a scene where its file puts them: moved, turned, scaled, copied, removed, or from files of their own."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ def arrange(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs
     """
     if not any(entry.is_placed for entry in scene.objects.values()):
         return scene, inputs, labels
+    scene, inputs, labels = _without_removed(scene, inputs, labels)
     total = inputs.gaussians.sh.shape[1]
     total = max([total, *(own.sh.shape[1] for own in inputs.own.values())])
     base, parts = _with_bands(inputs.gaussians, total), []
@@ -65,7 +66,24 @@ def arrange(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs
             owners.append(free)
     everything = jax.tree.map(lambda *columns: jnp.concatenate(columns), base, *parts)
     labels = _extended(labels, [len(part) for part in parts], owners)
-    return with_fields(scene, objects=objects), replace(inputs, gaussians=everything, ids=ids), labels
+    return with_fields(scene, objects=objects), replace(inputs, gaussians=everything, ids=ids, arranged=True), labels
+
+
+def _without_removed(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs, Labels]:
+    """Scene, inputs and labels without the objects that are removed, and without their Gaussians."""
+    gone = [name for name, entry in scene.objects.items() if entry.removed]
+    if not gone:
+        return scene, inputs, labels
+    kept = np.flatnonzero(~np.isin(np.asarray(labels.object_id), [inputs.ids[name] for name in gone]))
+    own = {name: getattr(labels, name)[kept] for name in ("object_id", "votes", "confidence")}
+    there = {name: entry for name, entry in scene.objects.items() if not entry.removed}
+    inputs = replace(
+        inputs,
+        gaussians=jax.tree.map(lambda column: column[kept], inputs.gaussians),
+        ids={name: number for name, number in inputs.ids.items() if name in there},
+        own={name: cloud for name, cloud in inputs.own.items() if name in there},
+    )
+    return with_fields(scene, objects=there), inputs, replace(labels, **own)
 
 
 def placement(gaussians: Gaussians, entry: ObjectSpec, name: str) -> Float[np.ndarray, "4 4"]:

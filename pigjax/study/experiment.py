@@ -157,8 +157,8 @@ class Experiment(eqx.Module):
             gravity=self.gravity,
             colliders=self.colliders,
             contact=self.contact,
-            pins=self.pins,
             forces=self.forces,
+            pins=self.pins,
         )
         return Outcome(self, end, trajectory, health)
 
@@ -205,7 +205,8 @@ class Experiment(eqx.Module):
 
     def _thing(self, section: str, entry: str) -> Collider | Force | None:
         """The collider or force of a name; None for all else."""
-        things = dict(zip((*self.solids, *self.pushes), (*self.colliders, *self.forces)))
+        things: dict[str, Collider | Force] = dict(zip(self.solids, self.colliders))
+        things |= zip(self.pushes, self.forces)
         return things.get(f"{section}.{entry}")
 
     def _with(self, name: str, value: Array) -> Experiment:
@@ -217,9 +218,10 @@ class Experiment(eqx.Module):
         if section == "simulation":
             return self._with_simulation(field, value)
         if (thing := self._thing(section, entry)) is not None:
-            kind = "forces" if section == "forces" else "colliders"
-            made = replace(thing, **change)
-            return replace(self, **{kind: tuple(made if own is thing else own for own in getattr(self, kind))})
+            made: Any = replace(thing, **change)
+            if section == "forces":
+                return replace(self, forces=tuple(made if own is thing else own for own in self.forces))
+            return replace(self, colliders=tuple(made if own is thing else own for own in self.colliders))
         rows = np.array(dict(self.rows)[entry])
         particles = self.particles
         if field == "velocity":
@@ -333,8 +335,8 @@ def _assemble(scene: Scene, inputs: Inputs, plan: Plan) -> Experiment:
         binding=plan.binding,
         grid=vast_grid(plan.dx),
         colliders=plan.colliders,
-        pins=plan.pins,
         forces=plan.forces,
+        pins=plan.pins,
         contact=plan.contact,
         gravity=jnp.asarray(plan.gravity, dtype),
         frame_dt=jnp.asarray(plan.frame_dt, dtype),
