@@ -102,8 +102,9 @@ def left_out(scene: Scene, report: RunReport) -> list[str]:
 def _modelled(scene: Scene, report: RunReport) -> dict[str, Any]:
     told = {name.replace("_", " "): value for name, value in report.modelled.items()}
     spec = scene.simulation
+    dx = report.sizes.get("dx", spec.dx)  # that which the run chose, where the scene gives none
     told |= {
-        "grid spacing": f"{spec.dx:g} m",
+        **({} if dx is None else {"grid spacing": f"{dx:g} m"}),
         "gravity": spec.gravity,
         "frames": f"{spec.frames} at {spec.fps:g} a second",
     }
