@@ -12,6 +12,7 @@ from rich.table import Table
 
 from pigjax.cli.base import (
     DropInvalid,
+    Images,
     NoCache,
     Origin,
     Out,
@@ -56,6 +57,7 @@ def reconstruct(
     sh_degree: Annotated[int, typer.Option(help="Bands of view-dependent colour.", min=0, max=3)] = 1,
     background: Annotated[float, typer.Option(help="Grey level behind the scene: 0 black, 1 white.")] = 0.0,
     max_size: Annotated[int | None, typer.Option(help="Shrink photos to this many pixels.")] = None,
+    images: Images = None,
     start_splats: Annotated[
         int | None, typer.Option(help="Begin with fewer Gaussians and double them during the first half.", min=4)
     ] = None,
@@ -81,7 +83,13 @@ def reconstruct(
     needs_masks = only is not None or random_background
     doublings = max(math.ceil(math.log2(splats / start_splats)), 1) if start_splats else 1
     loaded = io.load_views(
-        views, masks=needs_masks, missing_masks="abstain", max_size=max_size, background=background, origin=origin
+        views,
+        images=images,
+        masks=needs_masks,
+        missing_masks="abstain",
+        max_size=max_size,
+        background=background,
+        origin=origin,
     )
     points = io.load_points(loaded.points_path, origin=origin) if loaded.points_path else None
     config = FitConfig(
@@ -156,6 +164,7 @@ def segment(
         Path | None, typer.Argument(help="Posed photos with a folder object_mask beside them; not needed by --select.")
     ] = None,
     out: Out = Path("segments"),
+    images: Images = None,
     masks: Annotated[Path | None, typer.Option(help="Folder of masks, if it lies elsewhere.")] = None,
     names: Annotated[Path | None, typer.Option(help="JSON of mask ids and names.")] = None,
     tau_t: TauT = 0.5,
@@ -198,12 +207,14 @@ def segment(
         raise InputError("posed photos are missing: name them after the Gaussians, or choose objects by --select.")
     cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid, origin=origin)
     if select:
-        photos = None if views is None else io.load_views(views, origin=origin)
+        photos = None if views is None else io.load_views(views, images=images, origin=origin)
         chosen, numbers = select_files(cloud, select, out, views=photos, up=up, origin=origin, overwrite=overwrite)
         _tell_objects(numbers, {0: "the rest", **chosen}, out)
         return
     assert views is not None
-    loaded = io.load_views(views, masks=masks if masks is not None else True, missing_masks="abstain", origin=origin)
+    loaded = io.load_views(
+        views, images=images, masks=masks if masks is not None else True, missing_masks="abstain", origin=origin
+    )
     known = {} if names is None else io.load_names(names)
     settings = _settings(tau_t, tau_d, weighting, purity, min_seen)
     counts = segment_files(
@@ -227,6 +238,7 @@ def evaluate(
     gaussians: Annotated[Path, typer.Argument(help="Trained .ply, .splat or .spz of it.")],
     layout: Annotated[str, typer.Option("--format", help="lerf-mask, 3d-ovs, or views.")],
     out: Out = Path("evaluation"),
+    images: Images = None,
     masks: Annotated[Path | None, typer.Option(help="Folder or JSON of the masks to lift, if not object_mask.")] = None,
     labels: Annotated[Path | None, typer.Option(help="labels.npz of 'pigjax segment', instead of lifting.")] = None,
     prompts: Annotated[Path | None, typer.Option(help="JSON {prompt: id}.")] = None,
@@ -251,7 +263,7 @@ def evaluate(
 
     cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid, origin=origin)
     read = io.load_dataset(
-        dataset, layout, masks=masks, vote=labels is None, max_size=max_size, holes=holes, origin=origin
+        dataset, layout, images=images, masks=masks, vote=labels is None, max_size=max_size, holes=holes, origin=origin
     )
     with progress() as bar:
         tasks: dict[str, TaskID] = {}

@@ -81,7 +81,7 @@ def segment_files(
             "Gaussians": io.digest(gaussians),
             "cameras": io.digest(views.cameras),
             "photos": io.digest(views.images, views.names, views.splits),
-            "masks": io.digest(views.masks),
+            "masks": io.digest(views.masks) if views.valid is None else io.digest(views.masks, views.valid),
             "names": io.digest(names),
             "": {**settings, "fill": fill, "origin": origin, **({"associate": True} if associate else {})},
         }
@@ -95,7 +95,7 @@ def segment_files(
     if associate:
         tolerances = {name: settings[name] for name in ("tau_T", "tau_d") if name in settings}
         masks = associate_masks(gaussians, train.cameras, masks, **tolerances).masks
-    labels = lift(gaussians, train.cameras, masks, fill=fill, **settings)
+    labels = lift(gaussians, train.cameras, masks, fill=fill, valid=train.valid, **settings)
     object_id = np.asarray(labels.object_id)
     mark = io.digest_of_scene(gaussians) if origin is None else None  # else positions are not those of the file
     io.save_labels(out / "labels.npz", object_id, labels.votes, labels.confidence, labels.ids, scene=mark)

@@ -20,8 +20,8 @@ from pigjax.core.regions import below
 from pigjax.objects.editing import extract_object
 from pigjax.objects.overlay import colours_of, legend_sheet, overlay
 from pigjax.objects.selection import labels_of, select_colour, select_part, select_stroke
-from pigjax.scene.plan import axis_of
 from pigjax.scene.regions import region_from_words
+from pigjax.scene.world import axis_of
 from pigjax.segmentation import Labels, pixel_ids
 from pigjax.splat import Gaussians, render
 from pigjax.splatting.types import extent_of

@@ -66,7 +66,7 @@ def arrange(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs
             owners.append(free)
     everything = jax.tree.map(lambda *columns: jnp.concatenate(columns), base, *parts)
     labels = _extended(labels, [len(part) for part in parts], owners)
-    return with_fields(scene, objects=objects), replace(inputs, gaussians=everything, ids=ids), labels
+    return with_fields(scene, objects=objects), replace(inputs, gaussians=everything, ids=ids, arranged=True), labels
 
 
 def _without_removed(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs, Labels]:

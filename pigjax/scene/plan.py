@@ -18,7 +18,8 @@ from pigjax import io
 from pigjax.clamp import ClampParams
 from pigjax.core.camera import Camera, orbit, stack_cameras
 from pigjax.core.checks import joined, suggest
-from pigjax.core.errors import InputError, SceneError
+from pigjax.core.errors import SceneError
+from pigjax.core.placing import placed
 from pigjax.core.regions import Region
 from pigjax.coupling.binding import Binding, bind
 from pigjax.coupling.outliers import cut_outliers, told
@@ -35,7 +36,8 @@ from pigjax.objects.lifting import lift
 from pigjax.scene.advice import default_dx, remarks_on
 from pigjax.scene.forces import forces_of
 from pigjax.scene.framing import framing_camera
-from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec
+from pigjax.scene.schema import INPUT_FILES, CameraSpec, ClampSpec, Scene, SimulationSpec
+from pigjax.scene.world import WorldSpec, axis_of, file_to_world, height_of, metres_of, placed_cameras
 from pigjax.segmentation import Labels, fill_unseen
 from pigjax.splat import Gaussians, RenderConfig
 from pigjax.splatting.types import extent_of
@@ -53,6 +55,14 @@ class Inputs:
     names: dict[int, str]  # names that `input.names` gives to ids
     stored: io.StoredLabels | None = None  # of `input.labels`
     own: dict[str, Gaussians] = field(default_factory=dict)  # of the objects that have a file of their own
+    world: Float[np.ndarray, "4 4"] | None = None  # transform from the files; None: none
+    labels: Labels | None = None  # where the scale of the world needed them
+    arranged: bool = False  # whether objects were placed, copied or removed
+
+    @property
+    def moved(self) -> bool:
+        """Whether the Gaussians are not as their file has them."""
+        return self.arranged or self.world is not None
 
 
 @dataclass
@@ -88,13 +98,15 @@ def read_inputs(scene: Scene) -> Inputs:
     names = {} if spec.names is None else io.load_names(scene.path(spec.names))
     known = {name: _id_of(name, scene, names) for name in scene.objects}
     _check_ids({name: number for name, number in known.items() if number is not None})
-    gaussians = io.load_gaussians(scene.path(spec.gaussians), drop_invalid=spec.drop_invalid, origin=spec.origin)
+    gaussians = read_gaussians(scene)
     views = None
     if spec.views is not None:
         masks = True if spec.masks is None else scene.path(spec.masks)
+        photos = None if spec.images is None else scene.path(spec.images)
         views = io.load_views(
-            scene.path(spec.views), masks=masks, missing_masks="abstain", max_size=spec.max_size, origin=spec.origin
-        )
+            scene.path(spec.views), images=photos, masks=masks, missing_masks="abstain", max_size=spec.max_size,
+            origin=spec.origin,
+        )  # fmt: skip
     if scene.camera.view is not None:
         _camera_of_view(scene.camera, views)
     stored = None
@@ -106,7 +118,7 @@ def read_inputs(scene: Scene) -> Inputs:
         for name, entry in scene.objects.items()
         if entry.gaussians is not None
     }
-    return Inputs(gaussians, views, _numbered(known, names, views, stored), names, stored, own)
+    return _placed_inputs(scene, Inputs(gaussians, views, _numbered(known, names, views, stored), names, stored, own))
 
 
 def _numbered(
@@ -120,6 +132,16 @@ def _numbered(
         taken.append(int(stored.object_id.max(initial=0)))
     free = itertools.count(max(taken) + 1)
     return {name: next(free) if number is None else number for name, number in known.items()}
+
+
+def read_gaussians(scene: Scene) -> Gaussians:
+    """Gaussians of the scene at rest, in the frame in which they are simulated.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    spec = scene.input
+    return io.load_gaussians(scene.path(spec.gaussians), drop_invalid=spec.drop_invalid, origin=spec.origin)
 
 
 def _id_of(name: str, scene: Scene, names: dict[int, str]) -> int | None:
@@ -151,6 +173,8 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
     Raises:
         SceneError: no Gaussian belongs to an object.
     """
+    if inputs.labels is not None:
+        return inputs.labels
     regions = {
         name: entry.within.to_region(joined("objects", name, "within"))
         for name, entry in scene.objects.items()
@@ -210,6 +234,7 @@ def _lifted(scene: Scene, inputs: Inputs, asked: dict[str, int]) -> Labels:
         tau_T=spec.tau_T,
         tau_d=spec.tau_d,
         background=spec.background,
+        valid=views.valid,
     )
     found = np.unique(np.maximum(labels.object_id, 0))
     for name, number in asked.items():
@@ -285,19 +310,24 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         sleep=None if spec.sleep is None else Sleep(speed=spec.sleep),
         gravity=vector,
         config=SimConfig(kernel=spec.kernel, cfl=spec.cfl, integrator=spec.integrator),
-        clamp=ClampParams(
-            tau_min=jnp.asarray(scene.clamp.tau_min),
-            tau_max=jnp.asarray(scene.clamp.tau_max),
-            lambda_R=jnp.asarray(scene.clamp.lambda_R),
-            lambda_S=jnp.asarray(scene.clamp.lambda_S),
-            relative=scene.clamp.relative,
-        ),
+        clamp=clamp_params(scene.clamp),
         frame_dt=frame_dt,
         dx=dx,
         pins=scene.pins(),
         starts=tuple(math.ceil(entry.start / frame_dt - 1e-9) for entry in moving.values()),
         remarks=[*lost, *remarks_on(scene, particles, table, vector, dx)],
         labels=labels,
+    )
+
+
+def clamp_params(spec: ClampSpec) -> ClampParams:
+    """Bounds and weights of a scene's eigen-clamp."""
+    return ClampParams(
+        tau_min=jnp.asarray(spec.tau_min),
+        tau_max=jnp.asarray(spec.tau_max),
+        lambda_R=jnp.asarray(spec.lambda_R),
+        lambda_S=jnp.asarray(spec.lambda_S),
+        relative=spec.relative,
     )
 
 
@@ -352,17 +382,6 @@ def _without_buried(inputs: Inputs, labels: Labels, solids: dict[str, Collider],
         buried = solid.distance(inputs.gaussians.means) < -0.25 * dx
         labels = replace(labels, object_id=jnp.where(buried, inputs.ids[name], labels.object_id))
     return labels
-
-
-def axis_of(name: str) -> Float[np.ndarray, "3"]:
-    """Unit vector of an axis by its name, "-y".
-
-    Raises:
-        InputError: it has another name.
-    """
-    if name.removeprefix("-") not in ("x", "y", "z"):
-        raise InputError(f"up = {name!r}: choose one of x, y, z, -x, -y, -z.")
-    return np.eye(3)["xyz".index(name[-1])] * (-1 if name.startswith("-") else 1)
 
 
 def make_cameras(
@@ -443,17 +462,48 @@ def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
         settings.pop(name)
     if scene.output.compress_states:
         settings["output"] = {"compress_states": True}
-    for name in ("gaussians", "views", "masks", "labels", "names"):
+    for name in INPUT_FILES:
         settings["input"].pop(name)
     views = inputs.views
     content = {
         "Gaussians": inputs.gaussians,
         "cameras": None if views is None else views.cameras,
         "photos": None if views is None else (views.images, views.names, views.splits),
-        "masks": None if views is None else views.masks,
+        "masks": None if views is None else views.masks if views.valid is None else (views.masks, views.valid),
         "ids of the objects": inputs.ids,
         "labels": inputs.stored,
         "Gaussians of objects": inputs.own,
     }
     digests = {name: io.digest(value) for name, value in content.items()}
     return io.parts_of({"": settings, "input files": digests, "precision": str(jnp.result_type(float))})
+
+
+def _placed_inputs(scene: Scene, inputs: Inputs) -> Inputs:
+    """The inputs in metres with z up, as the scene's `[world]` and the heights of its objects say.
+
+    Raises:
+        SceneError: nothing tells which way is up, or an object has no height.
+    """
+    tall = {name: spec.height for name, spec in scene.objects.items() if spec.height is not None}
+    if scene.world == WorldSpec() and not tall:
+        return inputs
+    gaussians, views = inputs.gaussians, inputs.views
+    matrix = file_to_world(scene.world, scene.input.up, gaussians, None if views is None else views.cameras)
+    inputs = _moved(inputs, gaussians, views, matrix)
+    for name, text in tall.items():
+        labels = segment(scene, inputs)
+        mine = np.flatnonzero(np.asarray(labels.object_id) == inputs.ids[name])
+        found = height_of(inputs.gaussians, mine, axis_of(scene.input.up))
+        if not found > 0:
+            raise SceneError(f"objects.{name}.height: its {len(mine)} Gaussians have no height; remove the field.")
+        matrix = np.dot(np.diag([*[metres_of(text, f"objects.{name}.height") / found] * 3, 1.0]), matrix)
+        inputs = _moved(inputs, gaussians, views, matrix)
+        inputs.labels = labels  # votes do not depend on units
+    return inputs
+
+
+def _moved(inputs: Inputs, gaussians: Gaussians, views: io.Views | None, matrix: Float[np.ndarray, "4 4"]) -> Inputs:
+    """The inputs with Gaussians and cameras of the files, moved."""
+    if views is not None:
+        views = replace(views, cameras=placed_cameras(views.cameras, matrix))
+    return replace(inputs, gaussians=placed(gaussians, matrix), views=views, world=matrix)

@@ -8,7 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from msgspec import field
+from msgspec import field, to_builtins
 from msgspec.structs import asdict, replace
 
 from pigjax import io
@@ -23,6 +23,7 @@ from pigjax.scene.accuracy import LEVELS, Accuracy, with_level
 from pigjax.scene.decode import Section, decode, merged
 from pigjax.scene.forces import AnyForce
 from pigjax.scene.regions import RegionSpec, regions_of
+from pigjax.scene.world import WorldSpec, axis_of, metres_of
 from pigjax.splatting.types import RenderConfig
 
 Triple = tuple[float, float, float]
@@ -34,6 +35,7 @@ _ANGLE = Limits(-1e6, 1e6, unit="degrees")
 _PIXELS = Limits(1, 16384, unit="px")
 _WEIGHT = Limits(-1e3, 1e3)
 _FRICTION = Limits(0, 1e6)
+INPUT_FILES = ("gaussians", "views", "images", "masks", "labels", "names")  # fields of `input` that hold paths
 
 
 class InputSpec(Section, frozen=True):
@@ -41,18 +43,21 @@ class InputSpec(Section, frozen=True):
 
     gaussians: str  # trained .ply
     views: str | None = None  # posed photos, which the masks belong to
+    images: str | None = None  # folder of the photos, where it is not the one that the cameras' file names
     masks: str | None = None  # folder of instance masks; None: `object_mask` beside the photos
     labels: str | None = None  # labels.npz of `pigjax segment`, instead of masks
     names: str | None = None  # JSON of mask ids and names
     max_size: Annotated[int, Limits(1, 65536, unit="px")] | None = None  # of the photos' longer side
     drop_invalid: bool = False  # leave out Gaussians with NaN or infinity instead of refusing the file
     origin: Triple | None = None  # subtracted from Gaussians and cameras in float64, for georeferenced files [m]
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"  # axis of the world that points up
+    # axis or direction of the world that points up; nothing is turned (`world.up` turns)
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | Triple = "z"
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """Masks belong to views, and labels stand for them."""
         yield "labels", self.labels is None or self.masks is None, "input.masks are given, too; remove one of the two"
         yield "masks", self.masks is None or self.views is not None, "masks belong to photos; give input.views, too"
+        yield "images", self.images is None or self.views is not None, "photos have cameras; give input.views, too"
 
 
 class SegmentationSpec(Section, frozen=True):
@@ -161,6 +166,7 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     within: RegionSpec | None = None  # Gaussians with their centres here are its own, whatever masks and labels say
     # outliers, which never become matter: "parts" cuts what lies apart from it, "largest" all but its largest part
     keep: Literal["parts", "largest", "all"] = "parts"
+    height: str | None = None  # its true height with a unit, as "0.6 m": gives the scale of the whole scene
     offset: Annotated[Triple, _PLACE] = (0.0, 0.0, 0.0)  # from where its Gaussians are
     rotation: Annotated[Triple, _ANGLE] = (0.0, 0.0, 0.0)  # axis times angle, about its middle: [0, 0, 90] about z
     scale: Annotated[float, Limits(0, 1e6, above=True)] = 1.0  # times its size, about its middle
@@ -311,6 +317,7 @@ class Scene(Section, frozen=True):
     input: InputSpec  # files
     simulation: SimulationSpec  # grid, frames, gravity
     objects: dict[str, ObjectSpec]  # by name
+    world: WorldSpec = WorldSpec()  # axes and units of the files
     segmentation: SegmentationSpec = SegmentationSpec()  # thresholds of the vote
     clamp: ClampSpec = ClampSpec()  # bounds and weights of the eigen-clamp
     camera: CameraSpec = CameraSpec()  # of the video
@@ -350,6 +357,16 @@ class Scene(Section, frozen=True):
         )
         yield "input.views", labelled or len(asked) <= 1, rule
         yield "camera.view", has_views or self.camera.view is None, "photos have cameras; give input.views, or an orbit"
+        tall = [name for name, spec in self.objects.items() if spec.height is not None]
+        known = self.world.units_per_metre is None
+        yield joined("objects", *tall[:1], "height"), known or not tall, "world.units_per_metre is given; remove one"
+        yield joined("objects", *tall[1:2], "height"), len(tall) < 2, f"objects.{joined(*tall[:1])} has one; remove one"
+        within = any(spec.within is not None for spec in self.objects.values())
+        rule = "regions of objects are in metres, which the height would have to give; give world.units_per_metre"
+        yield joined("objects", *tall[:1], "height"), not (tall and within), rule
+        up = self.input.up
+        rule = "world.up turns the scene so that z points up; remove input.up"
+        yield "input.up", self.world.up is None or up == "z", rule
         in_contact = moving > 1 and self.simulation.contact_friction is not None
         broken = broken_by(self.simulation.integrator) if in_contact else None
         yield "simulation.integrator", broken is None, f"{broken}, or remove simulation.contact_friction"
@@ -422,6 +439,15 @@ def read_file(path: Path, what: str) -> dict[str, Any]:
         raise SceneError(str(error)) from error
 
 
+def _check_up(scene: Scene) -> None:
+    for section, up in (("input", scene.input.up), ("world", scene.world.up)):
+        if up is not None and up != "auto":
+            try:
+                axis_of(up)
+            except InputError as error:
+                raise SceneError(f"{section}.{error}") from None
+
+
 def scene_from(
     values: dict[str, Any], *, folder: str | Path = ".", where: str = "scene", accuracy: str | None = None
 ) -> Scene:
@@ -444,6 +470,9 @@ def scene_from(
                 spec.to_material(name)
             if spec.within is not None:
                 spec.within.to_region(joined("objects", name, "within"))
+            if spec.height is not None:
+                metres_of(spec.height, joined("objects", name, "height"))
+        _check_up(scene)
         scene.colliders()
         scene.pins()
         for name, force in scene.forces.items():
@@ -451,3 +480,27 @@ def scene_from(
     except SceneError as error:
         raise SceneError(f"{where}: {error}") from error.__cause__
     return scene
+
+
+def values_of(scene: Scene, folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """Contents of a scene file in another folder that asks for the same: every field with its value.
+
+    The level of accuracy is "standard", since the fields hold the values that another level gave them.
+    """
+    values: dict[str, Any] = _given(to_builtins(scene))
+    values.pop("folder")
+    values["accuracy"] = "standard"
+    for name in INPUT_FILES:
+        if name in values["input"]:
+            values["input"][name] = os.path.relpath(scene.path(values["input"][name]), folder)
+    for entry in values["objects"].values():
+        if "gaussians" in entry:
+            entry["gaussians"] = os.path.relpath(scene.path(entry["gaussians"]), folder)
+    return values
+
+
+def _given(value: Any) -> Any:
+    """Without fields that are None, for which TOML has no form."""
+    if not isinstance(value, dict):
+        return value
+    return {key: _given(entry) for key, entry in value.items() if entry is not None}
