@@ -1,6 +1,7 @@
 """P2G and G2P by Warp kernels, on Warp's CPU target: the XLA path is the oracle, forward and reverse."""
 
 import importlib.util
+import re
 
 import jax
 import jax.numpy as jnp
@@ -186,6 +187,29 @@ def test_devices_share_the_particles(two_devices):
 def test_implicit_steps_transfer_by_warp_too():
     ours, oracle = (simulated(name, ("neo_hookean",), integrator="implicit") for name in ("warp", "xla"))
     check_equal(ours, oracle, 1e-5)
+
+
+@needs_warp
+@pytest.mark.slow
+def test_kernels_compile_for_cuda(tmp_path, monkeypatch):
+    """To PTX by the compiler that Warp brings; no device is needed. Nodes are added to 16 bytes at a time."""
+    import warp as wp
+
+    from pigjax.mpm.warp_kernels import transfer_kernels
+    from pigjax.splatting.warp_kernels import blend_kernels, list_kernels
+
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    kernels = [builder.__wrapped__(*of) for builder, of in (
+        (transfer_kernels, (3, True, True)), (transfer_kernels, (4, False, False)), (blend_kernels, (1, True)),
+        (blend_kernels, (4, False)), (list_kernels, (True,)),
+    )]  # fmt: skip
+    for launch in (launch for group in kernels for launch in group):
+        files = wp.compile_aot_module(launch.kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
+        text = "".join(file.read_text() for file in files if file.suffix == ".ptx")
+        name = launch.kernel.func.__qualname__
+        assert ".entry" in text, name
+        if name in ("pigjax_scatter_3_float", "pigjax_blend_adjoint_1_float"):
+            assert re.search(r"\b(red|atom)\.global[.a-z0-9]*\.v4", text), name
 
 
 def test_a_machine_without_a_gpu_takes_xla():
