@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from pigjax.core.arrays import real_field, static_field
+from pigjax.core.arrays import static_field
 from pigjax.core.backend import BACKENDS, check_backend
-from pigjax.core.checks import LARGEST_WHOLE, Limits, check_axes, check_fields
+from pigjax.core.checks import LARGEST_WHOLE, Limits, check_fields
 from pigjax.core.errors import InputError
 from pigjax.core.extent import Extent, scene_extent
-from pigjax.core.gaussians import Gaussians
+from pigjax.core.gaussians import Gaussians, Splats
 from pigjax.core.linalg import quat_to_matrix
 
 __all__ = [
@@ -28,27 +28,6 @@ __all__ = [
     "gaussian_factors",
 ]
 OUTPUTS = ("rgb", "alpha", "depth", "surface_depth", "object_weights", "normals", "features")
-
-
-class Splats(eqx.Module):
-    """Posed Gaussians, ready to draw. The covariance of each is factors @ factorsᵀ.
-
-    Raises:
-        InputError: an array has not its axes, or is not as long as the others.
-    """
-
-    means: Float[Array, "n 3"] = real_field()  # [m]
-    factors: Float[Array, "n 3 3"] = real_field()  # [m]
-    opacities: Float[Array, "n"] = real_field()  # in [0, 1]
-    sh: Float[Array, "n k 3"] = real_field()  # spherical harmonics, k = (degree + 1)²
-    # rotation of the matter since rest; view-dependent colour turns with it
-    sh_rotations: Float[Array, "n 3 3"] | None = real_field(default=None)
-
-    def __check_init__(self) -> None:
-        check_axes(self)
-
-    def __len__(self) -> int:
-        return self.means.shape[0]
 
 
 class Projected(eqx.Module):
