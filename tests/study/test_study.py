@@ -364,6 +364,7 @@ def test_votes_are_scored_by_the_held_out_masks():
         vote.with_parameters({"segmentation.tau_t": 0.5})
 
 
+@pytest.mark.slow  # test_segmentation.py holds the gradient of votes
 def test_soft_votes_have_a_slope(x64):
     vote = jax.tree.map(
         lambda a: a.astype(float) if jnp.issubdtype(a.dtype, jnp.floating) else a, voters(jnp.asarray(0.02))
