@@ -37,11 +37,13 @@ from pigjax.io.state import (
     load_pytree,
     load_state,
     readable_states,
+    remove_state,
     resumed,
     save_pytree,
     save_state,
     set_aside,
     signed,
+    state_frames,
 )
 from pigjax.io.video import read_video, write_video
 
@@ -85,6 +87,7 @@ __all__ = [
     "read_video",
     "readable_states",
     "remove",
+    "remove_state",
     "resumed",
     "safe_name",
     "safe_names",
@@ -97,6 +100,7 @@ __all__ = [
     "save_state",
     "set_aside",
     "signed",
+    "state_frames",
     "write_csv",
     "write_image",
     "write_json",
