@@ -289,6 +289,7 @@ BAD = {
         {"parameters": {"segmentation.tau_T": {"values": [0.5]}, "clamp.lambda_R": {"values": [1.0]}}},
         "study them apart",
     ),
+    "unknown result": ({"sweep": {"of": "ball.zz"}}, r"sweep.of = 'ball.zz': .*did you mean 'ball.z'"),
     "no target": ({"objective": {"function": "video"}}, "target is missing"),
 }
 
