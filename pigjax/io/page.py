@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import html
 import importlib.metadata
+import io
 import logging
 from collections.abc import Iterable, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from typing import Any
 
 import numpy as np
@@ -124,8 +125,9 @@ def _server(path: PathLike) -> Any:
     except ImportError:
         raise InputError(f"{path}: a page needs viser: pip install 'pigjax[view]'.") from None
     logging.getLogger("websockets").setLevel(logging.ERROR)
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    try:
-        yield server
-    finally:
-        server.stop()
+    with redirect_stdout(io.StringIO()):  # it prints the address that nobody needs
+        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+        try:
+            yield server
+        finally:
+            server.stop()
