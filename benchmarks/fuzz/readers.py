@@ -432,6 +432,7 @@ READERS: dict[str, Reader] = {
     "gaussians.spz": Reader(_packed(".spz"), _load),
     **({"gaussians.v4.spz": Reader(_packed(".spz", version=4), _load, share=5)} if find_spec("zstandard") else {}),
     "gaussians.splat": Reader(_splat, _load),
+    "gaussians.glb": Reader(lambda at: io.save_glb(at / "a.glb", _gaussians()), _load),
     "points.ply": Reader(_points_ply, lambda at: io.load_points(_only(at))),
     "points.bin": Reader(_points_bin, lambda at: io.load_points(_only(at))),
     "points.txt": Reader(

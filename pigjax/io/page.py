@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import html
 import importlib.metadata
+import io
 import logging
 from collections.abc import Iterable, Sequence
-from contextlib import contextmanager
-from itertools import pairwise
+from contextlib import contextmanager, redirect_stdout
 from typing import Any
 
 import numpy as np
@@ -60,22 +60,18 @@ def save_page(
         scene.set_up_direction(tuple(float(value) for value in up))
         if camera is not None:
             _begin_at(server, camera, np.asarray(up, np.float64))
-        handles: list[Any] = []
-        for frame in frames:
-            gaussians = as_gaussians(frame)
-            if not handles and not moving.all():
-                scene.add_gaussian_splats("/still", **_splats_of(gaussians, ~moving))
-            if not moving.any():
-                moving = np.arange(len(moving)) == 0
-            name = f"/frame_{len(handles):06d}"
-            handles.append(scene.add_gaussian_splats(name, **_splats_of(gaussians, moving), visible=not handles))
-        if not handles:
+        posed = (as_gaussians(frame) for frame in frames)
+        first = next(posed, None)
+        if first is None:
             raise InputError(f"{path}: no frames were given; give at least one.")
+        handles = [scene.add_gaussian_splats("/splats", **_splats_of(first, moving))] if moving.any() else []
+        if not moving.all():
+            scene.add_gaussian_splats("/still", **_splats_of(first, ~moving))
         record = server.get_scene_serializer()
-        for before, after in pairwise(handles):
+        for gaussians in posed:
             record.insert_sleep(1 / fps)
-            after.visible = True
-            before.visible = False
+            for handle in handles:
+                handle.buffer = _packed(**_splats_of(gaussians, moving))
         record.insert_sleep(1 / fps)
         page = record.as_html()
     licence = (importlib.metadata.distribution("viser").read_text("licenses/LICENSE") or "Apache License 2.0").strip()
@@ -102,6 +98,17 @@ def _splats_of(gaussians: Gaussians, rows: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
+def _packed(centers: np.ndarray, covariances: np.ndarray, rgbs: np.ndarray, opacities: np.ndarray) -> np.ndarray:
+    """Rows of viser's splats: position, a free word, upper triangle of the covariance in float16, RGBA."""
+    rows = np.zeros((len(centers), 8), np.uint32)
+    rows[:, :3] = np.ascontiguousarray(centers, np.float32).view(np.uint32)
+    upper = covariances.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    rows[:, 4:7] = np.ascontiguousarray(upper, np.float16).view(np.uint32)
+    rgba = np.round(np.clip(np.concatenate([rgbs, opacities], 1), 0, 1) * 255).astype(np.uint8)
+    rows[:, 7:] = np.ascontiguousarray(rgba).view(np.uint32)
+    return rows
+
+
 def _begin_at(server: Any, camera: Camera, up: np.ndarray) -> None:
     pose = np.asarray(camera.world_to_cam, np.float64)
     position = -np.einsum("ji,j->i", pose[:3, :3], pose[:3, 3])
@@ -118,8 +125,9 @@ def _server(path: PathLike) -> Any:
     except ImportError:
         raise InputError(f"{path}: a page needs viser: pip install 'pigjax[view]'.") from None
     logging.getLogger("websockets").setLevel(logging.ERROR)
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    try:
-        yield server
-    finally:
-        server.stop()
+    with redirect_stdout(io.StringIO()):  # it prints the address that nobody needs
+        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+        try:
+            yield server
+        finally:
+            server.stop()

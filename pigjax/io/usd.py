@@ -31,18 +31,20 @@ def save_usd(
     *,
     fps: float | int = 24,
     up: str = "Z",
+    metres_per_unit: float | int = 1.0,
     origin: Origin | None = None,
 ) -> None:
     """Write Gaussians over time as OpenUSD's ParticleField3DGaussianSplat with a time sample for each frame. Host.
 
-    Lengths are in m. What no frame changes is written once. Needs usd-core: `pip install 'pigjax[usd]'`.
+    What no frame changes is written once. Needs usd-core: `pip install 'pigjax[usd]'`.
 
     Args:
         path: `.usd` or `.usdc` (binary), or `.usda` (text).
         frames: the scene of each frame, Gaussians or posed splats, all of one count; a generator keeps memory small.
         fps: frames a second.
         up: axis that points up, "Y" or "Z", the two that USD knows.
-        origin: offset that `load_gaussians` subtracted [m]; it becomes a translation of the prim.
+        metres_per_unit: length of the positions' unit [m]; 1 for a scene in metres.
+        origin: offset that `load_gaussians` subtracted, in that unit; it becomes a translation of the prim.
 
     Raises:
         InputError: usd-core is missing, the suffix or `up` is another one, there are no frames, their counts differ, or
@@ -55,7 +57,7 @@ def save_usd(
     pxr = _pxr(path)
     stage = pxr.Usd.Stage.CreateInMemory()
     pxr.UsdGeom.SetStageUpAxis(stage, up)
-    pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    pxr.UsdGeom.SetStageMetersPerUnit(stage, float(metres_per_unit))
     stage.SetTimeCodesPerSecond(float(fps))
     stage.SetFramesPerSecond(float(fps))
     stage.SetDefaultPrim(pxr.UsdGeom.Xform.Define(stage, "/Scene").GetPrim())

@@ -20,7 +20,7 @@ from pigjax.core.camera import Camera
 from pigjax.core.checks import suggest
 from pigjax.core.errors import InputError
 from pigjax.core.gaussians import SH_CONSTANT
-from pigjax.core.placing import as_gaussians, placed, points_placed, up_to
+from pigjax.core.placing import as_gaussians, placed, points_placed, similarity, up_to
 from pigjax.coupling.surfaces import Surface, collider_surface, matter_surface
 from pigjax.scene.plan import render_config
 from pigjax.scene.replay import Run, load_run
@@ -68,6 +68,12 @@ class _Job:
         return self.out / folder / f"frame_{frame:06d}.{suffix}"
 
     @property
+    def fps(self) -> float:
+        """Exported frames a second: fewer where some are left out."""
+        steps = np.diff(self.frames)
+        return self.run.scene.simulation.fps / (float(np.median(steps)) if len(steps) and steps.min() > 0 else 1.0)
+
+    @property
     def origin(self) -> tuple[float, float, float] | None:
         """Offset that the scene subtracts from its files [m]."""
         return self.run.scene.input.origin
@@ -87,8 +93,8 @@ def export_run(
     """Write the frames of a run as files for other tools. Host.
 
     Splats are posed from the stored states with the run's clamp; view-dependent colour turns with the matter. All
-    positions lie where the capture does: `input.origin` is added again. `.glb` files are turned so that y points up,
-    as glTF asks; USD says which axis does.
+    positions lie where the capture does, in its units: `input.origin` is added again. `.glb` files are in metres with y
+    up, as glTF asks; USD says which axis points up, and how long its unit is.
 
     | `to` | files |
     |---|---|
@@ -164,7 +170,7 @@ def _ply(job: _Job) -> list[Path]:
 
 
 def _glb(job: _Job) -> list[Path]:
-    turn = up_to(job.run.up, _Y)
+    turn = _metres_with_y_up(job.run)
     paths = [job.path("glb", frame, "glb") for frame in job.frames]
     origin = None if job.origin is None else points_placed(np.asarray(job.origin)[None], turn)[0]
     for path, gaussians in zip(paths, job.splats(turn)):
@@ -172,12 +178,19 @@ def _glb(job: _Job) -> list[Path]:
     return paths
 
 
+def _metres_with_y_up(run: Run) -> np.ndarray:
+    """Transform from the capture to metres with y up, as glTF asks."""
+    return np.einsum("ij,jk->ik", np.diag([*[run.metres_per_unit] * 3, 1.0]), up_to(run.up, _Y))
+
+
 def _usd(job: _Job) -> list[Path]:
     path, up = job.out / "splats.usdc", job.run.up
     axis = next((name for name, unit in (("Y", _Y), ("Z", _Z)) if np.allclose(up, unit)), None)
     turn = np.eye(4) if axis else up_to(up, _Z)
     origin = None if job.origin is None else points_placed(np.asarray(job.origin)[None], turn)[0]
-    io.save_usd(path, job.splats(turn), fps=job.run.scene.simulation.fps, up=axis or "Z", origin=origin)
+    io.save_usd(
+        path, job.splats(turn), fps=job.fps, up=axis or "Z", metres_per_unit=job.run.metres_per_unit, origin=origin
+    )
     return [path]
 
 
@@ -188,7 +201,7 @@ def _html(job: _Job) -> list[Path]:
     camera = jax.tree.map(lambda values: values[0], job.run.cameras)
     frames = (as_gaussians(_rows_of(job.run.splats(frame), job.rows)) for frame in job.each())
     io.save_page(
-        path, frames, moving=moving, fps=scene.simulation.fps, up=axis_of(scene.input.up).tolist(), camera=camera,
+        path, frames, moving=moving, fps=job.fps, up=axis_of(scene.input.up).tolist(), camera=camera,
         title=Path(scene.input.gaussians).stem,
     )  # fmt: skip
     return [path]
@@ -198,15 +211,16 @@ def _fields(job: _Job, frame: int, *, tensors: bool) -> tuple[np.ndarray, dict[s
     particles, rows = job.run.particles(frame), job.run.rows
     kept = np.isin(rows["object"], job.objects)
     F = np.asarray(particles.F_visual)[kept]
+    turn, scale, _ = similarity(job.run.to_capture)
     fields = {
-        "velocity": np.asarray(particles.v)[kept],  # in the frame of the simulation
+        "velocity": (scale * np.einsum("ij,pj->pi", turn, np.asarray(particles.v)[kept])).astype(np.float32),
         "object": rows["object"][kept],
         "gaussian": rows["gaussian"][kept],
         "mass": rows["mass"][kept].astype(np.float32),
         "volume_ratio": np.linalg.det(F.astype(np.float64)).astype(np.float32),
     }
     if tensors:
-        fields["deformation"] = F
+        fields["deformation"] = np.einsum("ij,pjk,lk->pil", turn, F, turn).astype(np.float32)
     return job.points(np.asarray(particles.x)[kept]), fields
 
 
@@ -266,7 +280,7 @@ def _mesh(job: _Job, surface: Surface, colour: tuple[float, float, float] = (0.7
     vertices = points_placed(surface.vertices, job.run.to_capture)
     vertices = vertices if job.origin is None else vertices + np.asarray(job.origin)
     if job.mesh == "glb":
-        vertices = points_placed(vertices, up_to(job.run.up, _Y))
+        vertices = points_placed(vertices, _metres_with_y_up(job.run))
     return io.Mesh(vertices, surface.faces, colour)
 
 
@@ -308,7 +322,7 @@ def _film(job: _Job, suffix: str) -> list[Path]:
     if suffix == "gif":
         background = np.asarray(job.run.scene.camera.background, np.float32)
         pictures = (p[..., :3] * p[..., 3:] + background * (1 - p[..., 3:]) for p in pictures)
-    io.write_video(path, pictures, fps=job.run.scene.simulation.fps)
+    io.write_video(path, pictures, fps=job.fps)
     return [path]
 
 

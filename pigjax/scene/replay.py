@@ -18,6 +18,7 @@ from pigjax.clamp import ClampParams
 from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError, MissingFileError
+from pigjax.core.placing import similarity
 from pigjax.coupling.binding import Binding, bind, deform
 from pigjax.mpm import Particles
 from pigjax.mpm.colliders import Collider, SampledDistance
@@ -110,6 +111,11 @@ class Run:
         """Unit vector that points up in the frame of the Gaussians' file."""
         turned = np.einsum("ji,j->i", self.world[:3, :3], axis_of(self.scene.input.up))
         return turned / np.linalg.norm(turned)
+
+    @property
+    def metres_per_unit(self) -> float:
+        """Length of the files' unit [m]."""
+        return similarity(self.world)[1]
 
     @cached_property
     def rest(self) -> Particles:

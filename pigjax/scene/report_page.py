@@ -186,13 +186,14 @@ def chart(title: str, unit: str, series: Mapping[str, Float[np.ndarray, "t"]], s
         lines.append(f'<text x="{x - 6:.1f}" y="{y + 4:.1f}" text-anchor="end">{value:.3g}</text>')
     for frame in np.linspace(0, last, 5):
         x, _ = place(float(frame), low)
-        lines.append(f'<text x="{x:.1f}" y="{_HEIGHT - 18}" text-anchor="middle">{frame * step:.3g}</text>')
+        anchor = "end" if frame == last and last else "middle"
+        lines.append(f'<text x="{x:.1f}" y="{_HEIGHT - 18}" text-anchor="{anchor}">{frame * step:.3g}</text>')
     lines.append(f'<text x="{_WIDTH - _RIGHT}" y="{_HEIGHT - 4}" text-anchor="end">time [s]</text>')
     for index, (name, values) in enumerate(series.items()):
         colour = _COLOURS[index % len(_COLOURS)]
         points = " ".join(f"{x:.1f},{y:.1f}" for x, y in _places(values, place))
         lines.append(f'<polyline fill="none" stroke="{colour}" stroke-width="1.6" points="{points}"/>')
-        lines.append(f'<text x="{_LEFT + 95 * index}" y="{_HEIGHT - 4}" style="fill:{colour}">{escape(name)}</text>')
+        lines.append(f'<text x="{_LEFT + 110 * index}" y="{_HEIGHT - 4}" style="fill:{colour}">{escape(name)}</text>')
     caption = escape(title + (f" [{unit}]" if unit else ""))
     return (
         f'<figure><figcaption>{caption}</figcaption><svg role="img" aria-label="{caption}" width="{_WIDTH}"'

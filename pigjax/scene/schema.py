@@ -500,7 +500,7 @@ def values_of(scene: Scene, folder: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def _given(value: Any) -> Any:
-    """Without fields that are None, for which TOML has no form."""
+    """Without fields that are None, for which TOML has no form, and without empty tables."""
     if not isinstance(value, dict):
         return value
-    return {key: _given(entry) for key, entry in value.items() if entry is not None}
+    return {key: _given(entry) for key, entry in value.items() if entry is not None and entry != {}}

@@ -1,11 +1,13 @@
 """A run's folder becomes files for other tools, each drawn as the frame of the video is."""
 
 import dataclasses
+import importlib.util
 import re
 
 import jax.numpy as jnp
 import msgspec
 import numpy as np
+import plyfile
 import pytest
 import tomli_w
 from PIL import Image
@@ -207,6 +209,32 @@ def test_a_georeferenced_capture_is_exported_where_it_lies(thrown, tmp_path):
     (path,) = export_run(run, "glb", tmp_path, frames=[0])
     there = io.load_gaussians(path, origin=(4e5, 0, -5e6))
     np.testing.assert_allclose(np.asarray(there.means)[:, [0, 2, 1]] * [1, -1, 1], run.splats(0).means, atol=1e-5)
+
+
+def test_a_world_is_undone_and_gltf_is_in_metres(run, tmp_path):
+    """A capture in centimetres with -y up, whose run is in metres with z up."""
+    world = np.eye(4)
+    world[:3, :3] = 0.01 * np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    run = dataclasses.replace(run, world=world)
+    x, v = (np.asarray(values) for values in (run.splats(2).means, run.particles(2).v))
+    capture = 100 * x @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    (path,) = export_run(run, "ply", tmp_path, frames=[2])
+    np.testing.assert_allclose(io.ply.read_positions(path), capture, atol=1e-4)
+    (path,) = export_run(run, "glb", tmp_path, frames=[2])
+    there = np.asarray(io.load_gaussians(path).means)
+    np.testing.assert_allclose(there[:, 1], x[:, 2], atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(there, axis=1), np.linalg.norm(x, axis=1), atol=1e-5)
+    if importlib.util.find_spec("pxr"):
+        from pxr import Usd, UsdGeom
+
+        (path,) = export_run(run, "usd", tmp_path, frames=[0, 2])
+        stage = Usd.Stage.Open(str(path))
+        assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Z", pytest.approx(0.01))
+        assert stage.GetTimeCodesPerSecond() == 15, "every second frame of 30"
+    (path,) = export_run(run, "particles", tmp_path, frames=[2])
+    vertex = plyfile.PlyData.read(str(path))["vertex"]
+    speed = np.linalg.norm(np.stack([vertex[f"velocity_{n}"] for n in "xyz"], 1), axis=1)
+    np.testing.assert_allclose(speed, 100 * np.linalg.norm(v, axis=1), rtol=1e-4)
 
 
 def test_splats_are_posed_as_run_draws_them(run):
