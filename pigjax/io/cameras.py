@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +29,8 @@ from pigjax.io.lenses import sources, undistorted_ids, undistorted_photo
 from pigjax.io.mask_json import frame_order
 from pigjax.io.masks import load_masks
 from pigjax.io.origin import Origin, shifted_pose
+
+_COARSE_SIZE = 128  # [px] at which the share of valid pixels is told
 
 
 @checked
@@ -149,6 +151,45 @@ def load_cameras(
     shots = read_capture(path, images, origin).shots
     sizes = [_target_size(shot, max_size) for shot in shots]
     return _cameras(shots, sizes, _canvas(shots, sizes), origin), name_views(shots)
+
+
+class CaptureNotes(NamedTuple):
+    """What a capture says of its lenses and points, without its photos."""
+
+    lens: str  # in words
+    valid: float  # share of the undistorted pictures' pixels that the photos have, without masks
+    points: Path | None
+
+
+def describe_capture(path: PathLike, *, images: PathLike | None = None) -> CaptureNotes:
+    """Lenses, valid pixels and points of a capture, for `pigjax info`. Host.
+
+    Args:
+        path: as `load_views` takes it.
+        images: as `load_views` takes it.
+
+    Raises:
+        MissingFileError: as `load_cameras`.
+        InputError: as `load_cameras`.
+    """
+    capture = read_capture(path, images, None)
+    bent = [shot for shot in capture.shots if shot.lens is not None]
+    sizes = [_target_size(shot, _COARSE_SIZE) for shot in capture.shots]
+    width, height = _canvas(capture.shots, sizes)
+    shares = []
+    for shot, size in zip(capture.shots, sizes):
+        inside = 1.0
+        if shot.lens is not None:
+            at = shot.scaled(size)
+            inside = float(sources(shot.lens, at.focal, at.centre, size)[1].mean())
+        shares.append(inside * size[0] * size[1] / (width * height))
+    said = "pinhole"
+    if bent:
+        kinds = sorted({str(shot.lens.kind) for shot in bent if shot.lens is not None})
+        said = (
+            f"{' and '.join(kinds)} with distortion, of {len(bent)} of {len(capture.shots)} photos; undistorted at load"
+        )
+    return CaptureNotes(said, float(np.mean(shares)), capture.points)
 
 
 def load_view_masks(
