@@ -1,4 +1,4 @@
-"""A real capture as shot and as undistorted by COLMAP: one reconstruction. Needs the photos: `PIGJAX_REAL_DATA=folder`."""
+"""A real capture as shot and as undistorted by COLMAP: one reconstruction. Wants `PIGJAX_REAL_DATA=folder of plush`."""
 
 import os
 from pathlib import Path
