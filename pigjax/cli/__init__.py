@@ -12,11 +12,11 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-from pigjax.cli import objects, scenes, studies  # their commands join the app
+from pigjax.cli import objects, printing, scenes, starting, studies  # their commands join the app
 from pigjax.cli.base import app, console, one_device_per_core, said
 from pigjax.core.errors import InputError, SimulationError
 
-__all__ = ["app", "main", "objects", "one_device_per_core", "scenes", "studies"]
+__all__ = ["app", "main", "objects", "one_device_per_core", "printing", "scenes", "starting", "studies"]
 
 _STOPPED = "stopped; run the same command again to go on from the last saved state."
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -50,6 +50,7 @@ def main() -> None:
 
 
 def _tell(error: object, code: int) -> None:
+    console.quiet = False
     console.print(said(error, label="error: ", style="bold red"), soft_wrap=True)
     sys.exit(code)
 

@@ -1,24 +1,43 @@
-"""Shared by the commands: console, progress bars, devices."""
+"""Shared by the commands: console, options, progress, devices."""
 
 from __future__ import annotations
 
+import gc
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.text import Text
 
 from pigjax.core.errors import InputError
+from pigjax.io.compile_cache import SWITCH, use_compile_cache
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 # names come from files: nothing that is printed is taken for markup, a style is given by `said`
 console = Console(stderr=True, markup=False, emoji=False, highlight=False)
+answers = Console(markup=False, emoji=False, highlight=False)  # what a command was asked for, for a pipe or a file
 _MOST_DEVICES = 8  # an image has too few rows of tiles for more
+_MOST_LINES = 500  # of one stage where there is no terminal
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace results of other settings or files instead of refusing them.")
 ]
@@ -28,6 +47,12 @@ DropInvalid = Annotated[
 Images = Annotated[
     Path | None,
     typer.Option("--images", metavar="DIR", help="Folder of the photos, if not the one that the cameras' file names."),
+]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="FIELD=VALUE", help="Replace a field of the file: --set simulation.frames=8; repeat it."
+    ),
 ]
 Origin = Annotated[
     tuple[float, float, float] | None,
@@ -53,6 +78,24 @@ Out = Annotated[
 ]
 
 
+def _hush(quiet: bool) -> bool:
+    console.quiet = quiet
+    return quiet
+
+
+def _without_cache(no_cache: bool) -> bool:
+    if no_cache:
+        os.environ[SWITCH] = "off"
+    return no_cache
+
+
+NoCache = Annotated[
+    bool,
+    typer.Option("--no-cache", help="Compile everything anew and keep nothing of it.", callback=_without_cache),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors alone.", callback=_hush)]
+
+
 def said(text: object, *, label: str = "", style: str = "") -> Text:
     """A text as it is printed: literally, with control characters, which could steer a terminal, shown as U+FFFD.
 
@@ -70,6 +113,17 @@ def row(*cells: object) -> tuple[Text, ...]:
     return tuple(said(cell) for cell in cells)
 
 
+def prepare_jax() -> None:
+    """Use all cores, keep compiled programs for the next command, and look for garbage less often.
+
+    Tracing makes objects by the million, and hardly any of them is garbage: looking at the default rate slows it down.
+    """
+    one_device_per_core()
+    use_compile_cache()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
+
+
 def one_device_per_core() -> None:
     """On a CPU, XLA runs loops on one core per device; images and simulations are shared among them."""
     import jax
@@ -80,9 +134,70 @@ def one_device_per_core() -> None:
             jax.config.update("jax_num_cpu_devices", min(cores, _MOST_DEVICES))
 
 
+@dataclass
+class _Stage:
+    """A task of `Lines`, and when its first count came."""
+
+    description: str
+    total: float | int | None
+    fields: dict[str, Any]
+    completed: float | int | None = None
+    first: float | int = 0
+    begun: float = field(default_factory=time.monotonic)
+
+
+class Lines:
+    """Progress as lines, for a log file: one for each step done, with the time left; used as rich's `Progress` is.
+
+    A stage of more than 500 steps prints a line for each hundredth of them.
+    """
+
+    def __init__(self, columns: tuple[str, ...]) -> None:
+        self.tasks: list[_Stage] = []
+        self._columns = columns
+
+    def add_task(self, description: str, total: float | int | None = None, **fields: Any) -> TaskID:
+        """Begin a stage."""
+        self.tasks.append(_Stage(description, total, fields))
+        return TaskID(len(self.tasks) - 1)
+
+    def update(
+        self, task: TaskID, *, completed: float | int | None = None, total: float | int | None = None, **fields: Any
+    ) -> None:
+        """Count steps of a stage, and print a line where there are more than before."""
+        stage = self.tasks[task]
+        stage.fields |= fields
+        stage.total = stage.total if total is None else total
+        if completed is None or completed == stage.completed:
+            return
+        if stage.completed is None:
+            stage.first, stage.begun = completed if completed < (stage.total or 0) else 0, time.monotonic()
+        before, stage.completed = stage.completed or 0, completed
+        total = stage.total or 0
+        every = 1 if total <= _MOST_LINES else total / 100
+        if completed > 0 and (completed // every > before // every or completed == stage.total):
+            console.print(said(self._line(stage, completed)), soft_wrap=True)
+
+    def _line(self, stage: _Stage, completed: float | int) -> str:
+        spent, done = time.monotonic() - stage.begun, completed - stage.first
+        line = f"{stage.description} {completed:g}" + ("" if stage.total is None else f"/{stage.total:g}")
+        line += "".join(" " + column.format(task=stage) for column in self._columns)
+        if stage.total is not None and completed < stage.total and done > 0:
+            line += f", {_clock(spent / done * (stage.total - completed))} left"
+        return line + f", {_clock(spent)}"
+
+
+def _clock(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"
+
+
 @contextmanager
-def progress(*columns: str) -> Iterator[Progress]:
-    """Progress bar with time left."""
+def progress(*columns: str) -> Iterator[Progress | Lines]:
+    """Progress bars with the time left; `Lines` where the output is no terminal."""
+    if not console.is_terminal:
+        yield Lines(columns)
+        return
     texts = [TextColumn(column, markup=False) for column in ("{task.description:<12}", *columns)]
     bar = Progress(
         texts[0], BarColumn(), MofNCompleteColumn(), *texts[1:], TimeElapsedColumn(), TimeRemainingColumn(),

@@ -13,13 +13,15 @@ from rich.table import Table
 from pigjax.cli.base import (
     DropInvalid,
     Images,
+    NoCache,
     Origin,
     Out,
     Overwrite,
+    Quiet,
     app,
     console,
-    one_device_per_core,
     output_path,
+    prepare_jax,
     progress,
     row,
     said,
@@ -65,9 +67,11 @@ def reconstruct(
     seed: int = 0,
     origin: Origin = None,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Fit Gaussians to photos; writes OUT/gaussians.ply, and goes on from OUT/checkpoint if it was stopped."""
-    one_device_per_core()
+    prepare_jax()
     import jax
 
     from pigjax import io
@@ -78,7 +82,13 @@ def reconstruct(
     needs_masks = only is not None or random_background
     doublings = max(math.ceil(math.log2(splats / start_splats)), 1) if start_splats else 1
     loaded = io.load_views(
-        views, images=images, masks=needs_masks, max_size=max_size, background=background, origin=origin
+        views,
+        images=images,
+        masks=needs_masks,
+        missing_masks="abstain",
+        max_size=max_size,
+        background=background,
+        origin=origin,
     )
     points = io.load_points(loaded.points_path, origin=origin) if loaded.points_path else None
     config = FitConfig(
@@ -164,6 +174,8 @@ def segment(
     drop_invalid: DropInvalid = False,
     origin: Origin = None,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Lift masks to the Gaussians; writes labels, one .ply per object, and a sheet that shows which id is which.
 
@@ -173,7 +185,8 @@ def segment(
     from pigjax.cli.segmenting import segment_files
 
     cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid, origin=origin)
-    loaded = io.load_views(views, images=images, masks=masks if masks is not None else True, origin=origin)
+    given = masks if masks is not None else True
+    loaded = io.load_views(views, images=images, masks=given, missing_masks="abstain", origin=origin)
     known = {} if names is None else io.load_names(names)
     settings = _settings(tau_t, tau_d, weighting, purity, min_seen)
     counts = segment_files(
@@ -208,6 +221,8 @@ def evaluate(
     drop_invalid: DropInvalid = False,
     origin: Origin = None,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Score objects against true masks (mIoU, mBIoU); writes OUT/scores.json and OUT/sheet.png."""
     from pigjax import io

@@ -12,15 +12,18 @@ from rich.progress import TaskID
 from rich.table import Table
 
 from pigjax.cli.base import (
+    Changes,
     DropInvalid,
     Images,
+    NoCache,
     Origin,
     Out,
     Overwrite,
+    Quiet,
     app,
     console,
-    one_device_per_core,
     output_path,
+    prepare_jax,
     progress,
     row,
     said,
@@ -49,9 +52,16 @@ def example_folder() -> Path:
 
 
 @app.command()
-def demo(out: Out = Path("pigjax-demo"), accuracy: AccuracyOption = None, overwrite: Overwrite = False) -> None:
+def demo(
+    out: Out = Path("pigjax-demo"),
+    accuracy: AccuracyOption = None,
+    changes: Changes = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    no_cache: NoCache = False,
+) -> None:
     """Simulate the bundled tabletop scene and leave a video."""
-    _run(example_folder() / "scene.toml", out, accuracy, overwrite=overwrite)
+    _run(example_folder() / "scene.toml", out, accuracy, changes, overwrite=overwrite)
 
 
 @app.command()
@@ -59,27 +69,36 @@ def run(
     scene: Annotated[Path, typer.Argument(help="Scene file (.toml).")],
     out: Out = Path("out"),
     accuracy: AccuracyOption = None,
+    changes: Changes = None,
     drop_invalid: DropInvalid = False,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Simulate a scene and draw its video; a killed run goes on from its last frame."""
-    _run(scene, out, accuracy, drop_invalid=drop_invalid, overwrite=overwrite)
+    _run(scene, out, accuracy, changes, drop_invalid=drop_invalid, overwrite=overwrite)
 
 
-def _run(path: Path, out: Path, accuracy: str | None, *, drop_invalid: bool = False, overwrite: bool = False) -> None:
-    one_device_per_core()
+def _run(
+    path: Path,
+    out: Path,
+    accuracy: str | None,
+    changes: list[str] | None,
+    *,
+    drop_invalid: bool = False,
+    overwrite: bool = False,
+) -> None:
+    prepare_jax()
     from pigjax.scene import load_scene, run_scene
+    from pigjax.scene.decode import settings_from
 
-    scene = load_scene(path, accuracy=accuracy)
+    scene = load_scene(path, accuracy=accuracy, changes=settings_from(changes))
     if drop_invalid:
         scene = structs.replace(scene, input=structs.replace(scene.input, drop_invalid=True))
     with progress() as bar:
         tasks: dict[str, TaskID] = {}
 
         def tell(stage: str, done: int, of: int) -> None:
-            for other, task in tasks.items():
-                if other != stage:
-                    bar.update(task, completed=bar.tasks[task].total)
             if stage not in tasks:
                 tasks[stage] = bar.add_task(stage, total=of)
             bar.update(tasks[stage], completed=done, total=of)
@@ -118,9 +137,11 @@ def view(
     ] = 1.0,
     drop_invalid: DropInvalid = False,
     origin: Origin = None,
+    quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Draw a file from all around."""
-    one_device_per_core()
+    prepare_jax()
     from pigjax import io
     from pigjax.cli.turntable import turntable
 

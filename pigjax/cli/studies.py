@@ -10,7 +10,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from pigjax.cli.base import Out, Overwrite, app, console, one_device_per_core, progress, row, said
+from pigjax.cli.base import Changes, NoCache, Out, Overwrite, Quiet, app, console, prepare_jax, progress, row, said
 
 
 @app.command()
@@ -21,14 +21,18 @@ def sweep(
     processes: Annotated[int, typer.Option(help="How many processes take part.", min=1)] = 1,
     process: Annotated[int, typer.Option(help="Number of this one, from 0.", min=0)] = 0,
     overwrite: Overwrite = False,
+    changes: Changes = None,
+    quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Score every set of parameters of a study: OUT/table.csv, a plot, and the best as a scene; goes on if stopped."""
-    one_device_per_core()
+    prepare_jax()
     if coordinator is not None:
         _join(coordinator, processes, process)
+    from pigjax.scene.decode import settings_from
     from pigjax.study import load_study, sweep_study
 
-    loaded = load_study(study)
+    loaded = load_study(study, changes=settings_from(changes))
     with progress() as bar:
         task = bar.add_task("sweep", total=None)
         table = sweep_study(
@@ -61,12 +65,16 @@ def tune(
     out: Out = Path("tune"),
     method: Annotated[str | None, typer.Option(help="adam or cma, instead of what the study says.")] = None,
     overwrite: Overwrite = False,
+    changes: Changes = None,
+    quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Find the parameters of least loss: OUT/history.png, and the best as a scene OUT/best.toml; goes on if stopped."""
-    one_device_per_core()
+    prepare_jax()
+    from pigjax.scene.decode import settings_from
     from pigjax.study import load_study, tune_study
 
-    loaded = load_study(study, method=method)
+    loaded = load_study(study, method=method, changes=settings_from(changes))
     with progress("{task.fields[state]}") as bar:
         task = bar.add_task("tune", total=loaded.tune.steps, state="")
         best, history = tune_study(

@@ -69,7 +69,8 @@ def load_views(
             seen from the capture's folder, as in `images="images_4"`.
         masks: folder or JSON of instance masks (see `load_masks`); True means `object_mask` beside the photos' folder.
         merge: mask ids to replace, {3: 2} turns 3 into 2.
-        missing_masks: "error", or "empty": a view without a mask gets background everywhere.
+        missing_masks: "error"; "empty": a view without a mask gets background everywhere; or "abstain": it gets -1 and
+            does not vote (`Views.masked`).
         holes: background of up to this many pixels that one object encloses becomes that object.
         split: load only the views of this split.
         only: load only the views of these names, or of this one.
@@ -434,17 +435,37 @@ def _masks(
     canvas: tuple[int, int],
     **options: Any,
 ) -> Int[np.ndarray, "t h w"]:
-    """Ids of the undistorted pictures' pixels; those of photos are loaded size by size."""
+    """Ids of the undistorted pictures' pixels; -1 all over where a view has no mask and abstains."""
     masks = np.zeros((len(shots), canvas[1], canvas[0]), np.int32)
+    for i, ids in enumerate(_loaded_masks(folder, names, sizes, **options)):
+        if ids.min() < 0:
+            masks[i] = -1
+            continue
+        if (lens := shots[i].lens) is not None:
+            at = shots[i].scaled(sizes[i])
+            ids = undistorted_ids(ids, lens, at.focal, at.centre)
+        masks[i] = _padded(ids, canvas)
+    return masks
+
+
+def _loaded_masks(
+    folder: PathLike, names: Sequence[str], sizes: Sequence[tuple[int, int]], **options: Any
+) -> list[Int[np.ndarray, "h w"]]:
+    """Masks of the photos, size by size; that no view of one size has a mask is no error where others have."""
+    loaded: dict[int, np.ndarray] = {}
+    missing: MissingFileError | None = None
     for size in dict.fromkeys(sizes):
         of_size = [i for i, own in enumerate(sizes) if own == size]
-        loaded = load_masks(folder, [names[i] for i in of_size], size, **options)
-        for i, ids in zip(of_size, loaded):
-            if (lens := shots[i].lens) is not None:
-                at = shots[i].scaled(size)
-                ids = undistorted_ids(ids, lens, at.focal, at.centre)
-            masks[i] = _padded(ids, canvas)
-    return masks
+        try:
+            loaded |= zip(of_size, load_masks(folder, [names[i] for i in of_size], size, **options))
+        except MissingFileError as error:
+            if options.get("missing") != "abstain":
+                raise
+            missing = error
+            loaded |= {i: np.full(size[::-1], -1, np.int32) for i in of_size}
+    if missing is not None and all(ids.min() < 0 for ids in loaded.values()):
+        raise missing
+    return [loaded[i] for i in range(len(names))]
 
 
 def _valid(

@@ -22,7 +22,7 @@ from jaxtyping import Array, Shaped
 
 from pigjax.core.errors import InputError, StaleError
 from pigjax.io.archives import load_arrays, read_header, save_arrays
-from pigjax.io.files import PathLike, decoding, existing, writing
+from pigjax.io.files import PathLike, decoding, existing, remove, writing
 from pigjax.io.provenance import Parts, check_same
 
 _SIGNATURE = "signature"
@@ -32,11 +32,17 @@ Tree = TypeVar("Tree")
 
 
 def save_state(
-    folder: PathLike, frame: int, arrays: Mapping[str, Shaped[np.ndarray | Array, "..."]], *, signature: str
+    folder: PathLike,
+    frame: int,
+    arrays: Mapping[str, Shaped[np.ndarray | Array, "..."]],
+    *,
+    signature: str,
+    compress: bool = False,
 ) -> Path:
     """Write the arrays of one frame as `<frame>.npz`, whole or not at all, and give its path. Host.
 
-    `signature` names the run that they belong to (a hash of the scene and its sizes).
+    `signature` names the run that they belong to (a hash of the scene and its sizes). Compressed files are smaller and
+    slower to write.
 
     Raises:
         InputError: an array is named "signature", or the folder cannot be written.
@@ -44,14 +50,21 @@ def save_state(
     path = _frame_path(folder, frame)
     if _SIGNATURE in arrays:
         raise InputError(f"{path}: an array is named {_SIGNATURE!r}, which is taken; give it another name.")
-    save_arrays(path, {_SIGNATURE: np.asarray(signature), **arrays}, compress=False)
+    save_arrays(path, {_SIGNATURE: np.asarray(signature), **arrays}, compress=compress)
     return path
+
+
+def remove_state(folder: PathLike, frame: int) -> None:
+    """Remove the state of one frame; none there is no error. Host."""
+    remove(_frame_path(folder, frame))
 
 
 def load_state(
     folder: PathLike, frame: int, *, signature: str | None = None, prefix: str = ""
 ) -> dict[str, np.ndarray]:
     """The arrays of one frame whose names begin with `prefix`; others are not read. Host.
+
+    Numbers stored in half precision come in single precision.
 
     Raises:
         MissingFileError: the frame was not written.
@@ -61,7 +74,11 @@ def load_state(
     path = existing(_frame_path(folder, frame), "state file")
     state = _read(path, prefix=prefix)
     _check_signature(path, state, signature)
-    return {name: values for name, values in state.items() if name != _SIGNATURE}
+    return {name: _single(values) for name, values in state.items() if name != _SIGNATURE}
+
+
+def _single(values: np.ndarray) -> np.ndarray:
+    return values.astype(np.float32) if values.dtype == np.float16 else values
 
 
 def save_rows(folder: PathLike, arrays: Mapping[str, Shaped[np.ndarray | Array, "..."]], *, signature: str) -> Path:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import tomllib
 import types
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
@@ -17,7 +19,10 @@ _WHOLE = Limits(0, LARGEST_WHOLE)
 
 
 class Section(Struct, forbid_unknown_fields=True, frozen=True):
-    """A table of a file. Its fields' annotations hold types, choices and `Limits`."""
+    """A table of a file. Its fields' annotations hold types, choices and `Limits`.
+
+    A union of sections is told apart by their field `kind`, a `Literal` of one name.
+    """
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """Rules between fields: the dotted field to name, whether the rule holds, and the rule in words."""
@@ -58,6 +63,41 @@ def decode(values: Any, kind: type[S], name: str = "", **given: Any) -> S:
             said = f" = {shown(value)}" if isinstance(value, int | float | str | tuple) else ""
             raise SceneError(f"{joined(name, broken)}{said}: {rule}.")
     return made
+
+
+def settings_from(texts: Sequence[str] | None) -> dict[str, Any]:
+    """Nested values of texts such as "simulation.frames=8", as `merged` takes them.
+
+    A value is read as TOML reads it, and taken for a text where it is none: `objects.duck.material=rubber`.
+
+    Raises:
+        SceneError: a text has no "=", or its field is not a dotted name.
+    """
+    values: dict[str, Any] = {}
+    for text in texts or ():
+        name, equals, value = text.partition("=")
+        if not equals or (read := _read(name, value) or _read(name, json.dumps(value))) is None:
+            raise SceneError(f"--set {shown(text)}: give a field and its value, as in simulation.frames=8.")
+        values = merged(values, read)
+    return values
+
+
+def _read(name: str, value: str) -> dict[str, Any] | None:
+    """A line of TOML, nested as its dotted name says; None where it is none."""
+    line = f"{name} = {value}"
+    try:
+        return None if line.splitlines() != [line] else tomllib.loads(line)
+    except (tomllib.TOMLDecodeError, RecursionError):
+        return None
+
+
+def merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a file with those of the changes in their place, table by table."""
+    new = dict(values)
+    for key, change in changes.items():
+        both = isinstance(change, Mapping) and isinstance(new.get(key), Mapping)
+        new[key] = merged(new[key], change) if both else change
+    return new
 
 
 def numbers_of(kind: type[Struct]) -> Iterator[tuple[str, Any, Limits]]:
@@ -103,6 +143,8 @@ def _value(value: Any, kind: Any, name: str) -> Any:
     bare = _bare(kind)
     if isinstance(bare, type) and issubclass(bare, Section):
         return decode(value, bare, name)
+    if sections := sections_of(bare):
+        return decode(value, _chosen(value, sections, name), name)
     if get_origin(bare) is dict and get_args(bare)[1] is not Any:
         if not isinstance(value, Mapping):
             raise SceneError(f"{name} = {shown(value)}: it must be a table.")
@@ -120,6 +162,28 @@ def _value(value: Any, kind: Any, name: str) -> Any:
         raise SceneError(f"{name}{at} = {shown(_item(value, at))}: it must be {wanted(kind)}.") from None
     _check(made, limits_of(kind), name)
     return made
+
+
+def sections_of(kind: Any) -> list[type[Section]]:
+    """The sections of a union; empty for any other type."""
+    if get_origin(kind) not in (Union, types.UnionType):
+        return []
+    return [arg for arg in get_args(kind) if isinstance(arg, type) and issubclass(arg, Section)]
+
+
+def _chosen(value: Any, sections: list[type[Section]], name: str) -> type[Section]:
+    """The only section, or the one that the table's `kind` names."""
+    if len(sections) == 1:
+        return sections[0]
+    kinds = {get_args(field.type)[0]: one for one in sections for field in fields(one) if field.name == "kind"}
+    if not isinstance(value, Mapping):
+        raise SceneError(f"{name} = {shown(value)}: it must be a table.")
+    if "kind" not in value:
+        raise SceneError(f"{joined(name, 'kind')} is missing: give one of {', '.join(kinds)}.")
+    kind = value["kind"]
+    if not isinstance(kind, str) or kind not in kinds:
+        raise SceneError(f"{joined(name, 'kind')} = {shown(kind)}: {suggest(kind, kinds)}.")
+    return kinds[kind]
 
 
 def _check(made: Any, limits: Limits, name: str) -> None:

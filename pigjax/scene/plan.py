@@ -25,9 +25,11 @@ from pigjax.mls_mpm import SimConfig
 from pigjax.mpm import Particles
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.forces import Force
 from pigjax.mpm.materials import Material, MaterialTable
 from pigjax.mpm.sleep import Sleep
 from pigjax.objects.lifting import lift
+from pigjax.scene.forces import forces_of
 from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec
 from pigjax.scene.world import WorldSpec, axis_of, file_to_world, height_of, metres_of, placed_cameras
 from pigjax.segmentation import Labels
@@ -56,6 +58,7 @@ class Plan:
     binding: Binding | None
     colliders: tuple[Collider, ...]
     contact: BodyContact | None
+    forces: tuple[Force, ...]  # beside gravity
     sleep: Sleep | None
     gravity: Float[np.ndarray, "3"]
     config: SimConfig
@@ -81,7 +84,12 @@ def read_inputs(scene: Scene) -> Inputs:
         masks = True if spec.masks is None else scene.path(spec.masks)
         photos = None if spec.images is None else scene.path(spec.images)
         views = io.load_views(
-            scene.path(spec.views), images=photos, masks=masks, max_size=spec.max_size, origin=spec.origin
+            scene.path(spec.views),
+            images=photos,
+            masks=masks,
+            missing_masks="abstain",
+            max_size=spec.max_size,
+            origin=spec.origin,
         )
     if scene.camera.view is not None:
         _camera_of_view(scene.camera, views)
@@ -122,7 +130,7 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
         ids = jnp.asarray(sorted({0, only}), jnp.int32)
         votes = jnp.zeros((count, len(ids)), jnp.int32)
         return Labels(jnp.full(count, only, jnp.int32), votes, jnp.ones(count), ids=ids)
-    views = inputs.views.training
+    views = inputs.views.voters
     assert views.masks is not None
     check_ids_occur(inputs.ids, views.masks)
     labels = lift(
@@ -200,6 +208,7 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         binding=binding if len(binding) else None,
         colliders=colliders,
         contact=_contact(spec, len(moving)),
+        forces=forces_of(scene.forces, particles, {name: number for number, name in enumerate(moving)}),
         sleep=None if spec.sleep is None else Sleep(speed=spec.sleep),
         gravity=vector,
         config=SimConfig(kernel=spec.kernel, cfl=spec.cfl, integrator=spec.integrator),
@@ -314,8 +323,10 @@ def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
     Nor does the name of the accuracy count, but the values that it set do; files count by their content.
     """
     settings: dict[str, Any] = msgspec.to_builtins(scene)
-    for name in ("accuracy", "camera", "clamp", "drawing", "folder"):
+    for name in ("accuracy", "camera", "clamp", "drawing", "folder", "output"):
         settings.pop(name)
+    if scene.output.compress_states:
+        settings["output"] = {"compress_states": True}
     for name in ("gaussians", "views", "images", "masks", "names"):
         settings["input"].pop(name)
     views = inputs.views

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -89,6 +89,7 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: 
     with report.stage("segment"):
         tell("segment", 0, 1)
         labels = segment(scene, inputs)
+        tell("segment", 1, 1)
     with report.stage("seed"):
         tell("seed", 0, 1)
         plan = make_plan(scene, inputs, labels)
@@ -101,11 +102,15 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: 
             labels.ids,
             scene=_mark(scene, inputs),
         )
+        tell("seed", 1, 1)
     _describe(scene, inputs, plan, labels, report)
-    with report.stage("simulate"):
-        _simulate(scene, plan, out / "states", parts, key, report, tell)
+    states = _simulate(scene, plan, out / "states", parts, key, report, tell)
+    if scene.output.states_every == 1:
+        with report.stage("simulate"):
+            for _ in states:
+                pass
     with report.stage("draw"):
-        _draw(scene, inputs, plan, labels, out, key, report, tell)
+        _draw(scene, inputs, plan, labels, out, key, report, tell, states)
 
 
 def _mark(scene: Scene, inputs: Inputs) -> str | None:
@@ -125,6 +130,7 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
         "colliders": [type(c).__name__ for c in plan.colliders],
         "kernel": plan.config.kernel,
         "clamp": scene.clamp.mode,
+        "forces": [type(force).__name__ for force in plan.forces],
         "body_contact": plan.contact is not None,
         "sleep": plan.sleep is not None,
         "sh_coefficients": inputs.gaussians.sh.shape[1],
@@ -155,8 +161,8 @@ def _particles_of(
 
 def _simulate(
     scene: Scene, plan: Plan, folder: Path, parts: dict[str, str], key: str, report: RunReport, tell: Progress
-) -> None:
-    """Simulate the frames that are not on disk yet, from the last checkpoint on.
+) -> Iterator[int]:
+    """Simulate the frames that are not on disk yet, from the last checkpoint on; yields the last one that is there.
 
     States that are missing before it are simulated again from the start, with the same bits.
     """
@@ -174,6 +180,7 @@ def _simulate(
         frame_dt=plan.frame_dt,
         gravity=plan.gravity,
         colliders=plan.colliders,
+        forces=plan.forces,
     )
     run = partial(
         simulate,
@@ -184,14 +191,18 @@ def _simulate(
         gravity=plan.gravity,
         colliders=plan.colliders,
         contact=plan.contact,
+        forces=plan.forces,
         active_grid=active,
     )
     saved = io.resumed(checkpoint, (np.zeros((), np.int64), particles, active.memory()), parts=parts)
     last = 0 if saved is None else int(saved[0])
     missing = set(range(last + 1)) - present  # of a run without a checkpoint all frames from the first are made again
     repaired = 0 if saved is None else max(missing, default=0)
+    # of all frames, as their states may not stay on disk
+    records = {0: health_record(particles, None, plan.gravity)} | _records(folder, present, key)
+    half = scene.output.compress_states
     if saved is None or 0 in missing:
-        _save(folder, 0, particles, health_record(particles, None, plan.gravity), key)
+        _save(folder, 0, particles, records[0], key, half=half)
     if saved is None:
         _checkpoint(checkpoint, 0, particles, active, parts)
     if repaired:
@@ -209,44 +220,48 @@ def _simulate(
             yield from run(resumed, frames=range(last, frames))
 
     tell("simulate", 0 if repaired else last, frames)
+    yield 0 if repaired else last
     for frame, after, _, health in todo():
-        record = health_record(after, health, plan.gravity)
+        records[frame] = record = health_record(after, health, plan.gravity)
         if health.is_broken():
-            report.health |= summary(_records(folder, frame - 1, key) | {frame: record})
+            report.health |= summary({number: known for number, known in records.items() if number <= frame})
             raise SimulationError(
                 f"frame {frame} of {frames}: {', '.join(health.problems())}; states up to frame {frame - 1} are kept in"
                 f" {folder}. Lower simulation.cfl, or make matter softer or slower."
             )
         if frame > last or frame in missing:
-            _save(folder, frame, after, record, key)
+            _save(folder, frame, after, record, key, half=half)
         if frame > last:
             _checkpoint(checkpoint, frame, after, active, parts)
         if frame < frames:
             tell("simulate", frame, frames)
+        yield frame
     tell("simulate", frames, frames)
-    records = _records(folder, frames, key)
     most = max((int(record["substeps"]) for frame, record in records.items() if frame), default=rule.first)
     report.sizes |= {"substeps_per_frame": most, "last_grid": active.shape, "resumed_from_frame": last}
     report.health |= summary(records)
-    report.warnings += remarks(report.health, driven=any(collider.moves for collider in plan.colliders))
+    driven = bool(plan.forces) or any(collider.moves for collider in plan.colliders)
+    report.warnings += remarks(report.health, driven=driven)
     if isinstance(active, Sleeper):
         report.sizes["asleep_at_the_end"] = int(active.asleep.sum())
 
 
-def _records(folder: Path, frames: int, key: str) -> dict[int, Record]:
-    """Health of each frame, from the states on disk."""
+def _records(folder: Path, frames: Iterable[int], key: str) -> dict[int, Record]:
+    """Health of each of the frames, from the states on disk."""
     records: dict[int, Record] = {}
-    for frame in range(frames + 1):
+    for frame in frames:
         state = io.load_state(folder, frame, signature=key, prefix=MARK)
         if state:
             records[frame] = {name.removeprefix(MARK): values for name, values in state.items()}
     return records
 
 
-def _save(folder: Path, frame: int, particles: Particles, record: Record, key: str) -> None:
-    arrays: dict[str, Any] = {"x": particles.x, "v": particles.v, "F_visual": particles.F_visual}
-    arrays |= {MARK + name: values for name, values in record.items()}
-    io.save_state(folder, frame, {name: np.asarray(a) for name, a in arrays.items()}, signature=key)
+def _save(folder: Path, frame: int, particles: Particles, record: Record, key: str, *, half: bool) -> None:
+    arrays = {name: np.asarray(getattr(particles, name)) for name in ("x", "v", "F_visual")}
+    if half:
+        arrays |= {name: arrays[name].astype(np.float16) for name in ("v", "F_visual")}
+    arrays |= {MARK + name: np.asarray(values) for name, values in record.items()}
+    io.save_state(folder, frame, arrays, signature=key, compress=half)
 
 
 def _checkpoint(path: Path, frame: int, particles: Particles, active: ActiveGrid, parts: dict[str, str]) -> None:
@@ -254,9 +269,17 @@ def _checkpoint(path: Path, frame: int, particles: Particles, active: ActiveGrid
 
 
 def _draw(
-    scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, out: Path, key: str, report: RunReport, tell: Progress
+    scene: Scene,
+    inputs: Inputs,
+    plan: Plan,
+    labels: Labels,
+    out: Path,
+    key: str,
+    report: RunReport,
+    tell: Progress,
+    states: Iterator[int],
 ) -> None:
-    """Pose and render each saved state."""
+    """Pose and render each saved state, once `states` says that it is there; remove it where it is not to be kept."""
     frames, gaussians = scene.simulation.frames, inputs.gaussians
     focus = np.asarray(plan.particles.x).mean(0)
     cameras = make_cameras(scene, inputs, focus)
@@ -278,16 +301,36 @@ def _draw(
     sheet_frames = np.unique(np.linspace(0, frames, _SHEET_FRAMES).round().astype(int))
     sheet: list[np.ndarray] = []
 
+    every, within = scene.output.states_every, report.times["draw"]
+
+    def wait_for(frame: int, there: int) -> int:
+        """Simulate until the state of a frame is there; `there` is the last one so far."""
+        with report.stage("simulate"):
+            before = replace(report.times["simulate"])
+            while there < frame and (now := next(states, None)) is not None:
+                there = now
+        spent = report.times["simulate"]
+        within.total -= spent.total - before.total  # simulating is no part of drawing
+        within.compile -= spent.compile - before.compile
+        return there
+
     def pictures() -> Iterator[np.ndarray]:
+        there = frames if every == 1 else -1
         for frame in range(frames + 1):
+            there = there if there >= frame else wait_for(frame, there)
             tell("draw", frame, frames + 1)
             picture = np.asarray(draw(frame))
+            if not every or (frame % every and frame < frames):
+                io.remove_state(out / "states", frame)
             if frame in sheet_frames:
                 sheet.append(picture)
             yield picture
 
     io.write_video(out / "video.mp4", pictures(), fps=scene.simulation.fps)
     tell("draw", frames + 1, frames + 1)
+    wait_for(frames + 1, frames)  # for the health of the whole simulation
+    if not every:
+        io.remove(out / "states" / "last.ckpt")
     io.write_image(out / "contact_sheet.png", io.contact_sheet(sheet))
     _draw_objects(inputs, labels, cameras[0], sheet[0], out / "objects.png")
     for name in (*_FILES, "states"):

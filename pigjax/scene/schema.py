@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -19,7 +19,8 @@ from pigjax.mpm.colliders import Box, Capsule, Collider, Cylinder, Plane, Sphere
 from pigjax.mpm.contact import broken_by
 from pigjax.mpm.materials import LAWS, PRESETS, Material, Parameters
 from pigjax.scene.accuracy import LEVELS, Accuracy, with_level
-from pigjax.scene.decode import Section, decode
+from pigjax.scene.decode import Section, decode, merged
+from pigjax.scene.forces import AnyForce
 from pigjax.scene.world import WorldSpec, axis_of, metres_of
 from pigjax.splatting.types import RenderConfig
 
@@ -127,6 +128,14 @@ class DrawingSpec(Section, frozen=True):
     # fainter contributions are skipped; the bound is the opacity that no splat exceeds
     alpha_min: Annotated[float, Limits(0, RenderConfig.alpha_max, below=True)] = 1 / 255
     transmittance_min: Annotated[float, Limits(0, 1, below=True)] = 1e-4  # a pixel is closed before it falls below
+
+
+class OutputSpec(Section, frozen=True):
+    """Files beside the video: the folder `states`, which a killed run goes on from and later drawings read."""
+
+    # frames from one kept state to the next, the last frame's beside them; 0: none, and a killed run begins again
+    states_every: Annotated[int, Limits(0, 100_000)] = 1
+    compress_states: bool = False  # deformation and velocity in half precision, deflated: half the size
 
 
 class ObjectSpec(Section, frozen=True, kw_only=True):
@@ -265,12 +274,14 @@ class Scene(Section, frozen=True):
     clamp: ClampSpec = ClampSpec()  # bounds and weights of the eigen-clamp
     camera: CameraSpec = CameraSpec()  # of the video
     drawing: DrawingSpec = DrawingSpec()  # accuracy of the video
+    output: OutputSpec = OutputSpec()  # states that stay
     accuracy: Accuracy = "standard"  # sets the fields that the file leaves open, and scales its dx; see `accuracy`
     planes: dict[str, PlaneSpec] = field(default_factory=dict)  # colliders by name
     boxes: dict[str, BoxSpec] = field(default_factory=dict)  # colliders by name
     spheres: dict[str, SphereSpec] = field(default_factory=dict)  # colliders by name
     capsules: dict[str, CapsuleSpec] = field(default_factory=dict)  # colliders by name
     cylinders: dict[str, CylinderSpec] = field(default_factory=dict)  # colliders by name
+    forces: dict[str, AnyForce] = field(default_factory=dict)  # beside gravity, by name
     folder: str = "."  # set by `load_scene`; the base of relative paths
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
@@ -283,6 +294,12 @@ class Scene(Section, frozen=True):
                 owner = owners.setdefault(spec.id, name)
                 rule = f"{spec.id} is the id of objects.{joined(owner)}, too; each object has an id of its own"
                 yield joined("objects", name, "id"), owner == name, rule
+        moving_names = [name for name, spec in self.objects.items() if not spec.fixed]
+        for name, force in self.forces.items():
+            for entry in force.objects or ():
+                known = entry in moving_names
+                rule = f"{entry!r} is no object that moves; {suggest(entry, moving_names)}"
+                yield joined("forces", name, "objects"), known, rule
         has_views = self.input.views is not None
         yield "input.views", has_views or len(self.objects) == 1, "several objects need photos with masks; give them"
         yield "camera.view", has_views or self.camera.view is None, "photos have cameras; give input.views, or an orbit"
@@ -323,12 +340,13 @@ _COLLIDERS = ("planes", "boxes", "spheres", "capsules", "cylinders")
 
 
 @checked
-def load_scene(path: str | Path, *, accuracy: str | None = None) -> Scene:
+def load_scene(path: str | Path, *, accuracy: str | None = None, changes: Mapping[str, Any] | None = None) -> Scene:
     """Read and check a scene file. Host.
 
     Args:
         path: the file (.toml).
         accuracy: "draft", "standard" or "reference", instead of the file's.
+        changes: fields that differ from the file, nested as its tables are: {"simulation": {"frames": 8}}.
 
     Raises:
         MissingFileError: there is no such file.
@@ -337,7 +355,8 @@ def load_scene(path: str | Path, *, accuracy: str | None = None) -> Scene:
             impossible.
     """
     path = Path(path)
-    return scene_from(read_file(path, "scene file"), folder=path.parent, where=str(path), accuracy=accuracy)
+    values = merged(read_file(path, "scene file"), changes or {})
+    return scene_from(values, folder=path.parent, where=str(path), accuracy=accuracy)
 
 
 def read_file(path: Path, what: str) -> dict[str, Any]:
@@ -388,6 +407,8 @@ def scene_from(
                 metres_of(spec.height, joined("objects", name, "height"))
         _check_up(scene)
         scene.colliders()
+        for name, force in scene.forces.items():
+            force.to_force(joined("forces", name))
     except SceneError as error:
         raise SceneError(f"{where}: {error}") from error.__cause__
     return scene

@@ -16,7 +16,7 @@ from msgspec import field
 from pigjax.core.arguments import checked
 from pigjax.core.checks import LARGEST_WHOLE, Limits, joined, suggest
 from pigjax.core.errors import SceneError
-from pigjax.scene.decode import Section, decode
+from pigjax.scene.decode import Section, decode, merged
 from pigjax.scene.schema import Scene, read_file, scene_from
 
 Value = float | tuple[float, ...]
@@ -232,7 +232,7 @@ def _put(values: dict[str, Any], name: str, value: Any) -> None:
 
 
 @checked
-def load_study(path: str | Path, *, method: str | None = None) -> Study:
+def load_study(path: str | Path, *, method: str | None = None, changes: Mapping[str, Any] | None = None) -> Study:
     """Read and check a study file. Host.
 
     A study whose objective is a function of a Python file runs that file: where it lies outside the working folder, a
@@ -241,6 +241,7 @@ def load_study(path: str | Path, *, method: str | None = None) -> Study:
     Args:
         path: the file (.toml).
         method: "adam" or "cma", instead of the file's `tune.method`.
+        changes: fields that differ from the file, nested as its tables are: {"tune": {"steps": 8}}.
 
     Raises:
         MissingFileError: there is no such file.
@@ -248,7 +249,7 @@ def load_study(path: str | Path, *, method: str | None = None) -> Study:
             or a value is out of range.
     """
     path = Path(path)
-    values = read_file(path, "study file")
+    values = merged(read_file(path, "study file"), changes or {})
     if method is not None:
         tune = values.get("tune", {})
         values["tune"] = tune | {"method": method} if isinstance(tune, dict) else tune
