@@ -20,6 +20,7 @@ from pigjax.io.files import (
     remove,
     safe_name,
     safe_names,
+    toml_text,
     write_json,
     write_text,
     write_toml,
@@ -27,7 +28,7 @@ from pigjax.io.files import (
 )
 from pigjax.io.formats import load_gaussians, origin_of, read_gaussians
 from pigjax.io.gltf import Mesh, save_glb, save_mesh
-from pigjax.io.images import contact_sheet, png_bytes, read_image, write_image
+from pigjax.io.images import contact_sheet, data_uri, read_image, write_image
 from pigjax.io.labels import StoredLabels, digest_of_scene, load_labels, save_labels
 from pigjax.io.masks import load_masks, save_masks
 from pigjax.io.page import save_page
@@ -35,6 +36,7 @@ from pigjax.io.ply import load_ply, load_points, read_ply, save_ply
 from pigjax.io.points import save_points
 from pigjax.io.provenance import check_same, claim, digest, file_digest, parts_of
 from pigjax.io.state import (
+    ROWS,
     STATES,
     last_state,
     load_pytree,
@@ -55,6 +57,7 @@ from pigjax.io.video import read_video, write_video
 
 __all__ = [
     "LAYOUTS",
+    "ROWS",
     "STATES",
     "Dataset",
     "Mesh",
@@ -63,6 +66,7 @@ __all__ = [
     "check_same",
     "claim",
     "contact_sheet",
+    "data_uri",
     "decoding",
     "describe_capture",
     "digest",
@@ -88,7 +92,6 @@ __all__ = [
     "output_folder",
     "parts_of",
     "plain_label",
-    "png_bytes",
     "read_gaussians",
     "read_image",
     "read_json",
@@ -118,6 +121,7 @@ __all__ = [
     "set_aside",
     "signed",
     "state_frames",
+    "toml_text",
     "write_csv",
     "write_image",
     "write_json",

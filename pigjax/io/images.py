@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -186,15 +187,15 @@ def write_image(path: PathLike, image: Picture) -> None:
             raise InputError(f"{path}: {error}; use a suffix such as .png or .jpg.") from None
 
 
-def png_bytes(image: Picture) -> bytes:
-    """A picture in RGB, RGBA or grey as the bytes of a `.png`, to lie within a page.
+def data_uri(image: Picture) -> str:
+    """A picture in RGB or grey as the address of itself, a JPEG, to lie within a page.
 
     Raises:
         InputError: the array is no picture.
     """
     room = io.BytesIO()
-    Image.fromarray(to_uint8(image)).save(room, "png")
-    return room.getvalue()
+    Image.fromarray(rgb_uint8(image)).save(room, "jpeg", quality=88)
+    return f"data:image/jpeg;base64,{base64.b64encode(room.getvalue()).decode()}"
 
 
 @checked

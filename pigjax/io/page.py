@@ -60,7 +60,7 @@ def save_page(
         scene.set_up_direction(tuple(float(value) for value in up))
         if camera is not None:
             _begin_at(server, camera, np.asarray(up, np.float64))
-        handles = []
+        handles: list[Any] = []
         for frame in frames:
             gaussians = as_gaussians(frame)
             if not handles and not moving.all():

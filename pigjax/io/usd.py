@@ -144,12 +144,18 @@ def read_usd(path: PathLike, *, frame: float | int | None = None) -> dict[str, n
 
     Raises:
         MissingFileError: there is no such file.
-        InputError: usd-core is missing, the file is damaged, holds no such field, or its arrays do not fit.
+        InputError: usd-core is missing, the file is damaged or draws on other files, holds no such field, or its arrays
+            do not fit.
     """
     path = existing(path, "file of Gaussians")
     pxr = _pxr(path)
     with decoding(path, "USD file", remedy="export it again"):
-        stage = pxr.Usd.Stage.Open(str(path), pxr.Usd.Stage.LoadNone)
+        layer = pxr.Sdf.Layer.FindOrOpen(str(path))
+        if layer is None:
+            raise ValueError("it is no layer")
+        if others := layer.GetCompositionAssetDependencies():
+            raise InputError(f"{path}: draws on other files ({others[0]}), which are not read; flatten it (usdcat -f).")
+        stage = pxr.Usd.Stage.Open(layer)
         prim = next((p for p in stage.Traverse() if p.GetTypeName() == "ParticleField3DGaussianSplat"), None)
         if prim is None:
             raise InputError(f"{path}: holds no ParticleField3DGaussianSplat; give a USD file of Gaussians.")
@@ -181,6 +187,7 @@ def read_usd(path: PathLike, *, frame: float | int | None = None) -> dict[str, n
 def _pxr(path: PathLike) -> Any:
     try:
         import pxr.Gf
+        import pxr.Sdf
         import pxr.Tf
         import pxr.Usd
         import pxr.UsdGeom

@@ -30,8 +30,17 @@ from pigjax.mpm.materials import Material, MaterialTable
 from pigjax.mpm.sleep import Sleep
 from pigjax.objects.lifting import lift
 from pigjax.scene.forces import forces_of
-from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec
-from pigjax.scene.world import WorldSpec, axis_of, file_to_world, height_of, metres_of, placed_cameras
+from pigjax.scene.schema import INPUT_FILES, CameraSpec, ClampSpec, Scene, SimulationSpec
+from pigjax.scene.world import (
+    WorldSpec,
+    axis_of,
+    described,
+    file_to_world,
+    height_of,
+    matrix_of,
+    metres_of,
+    placed_cameras,
+)
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, RenderConfig
 from pigjax.splatting.types import extent_of
@@ -75,10 +84,8 @@ def read_inputs(scene: Scene) -> Inputs:
         SceneError: an object has no id of its own, or `camera.view` is not the name of a photo.
     """
     spec = scene.input
-    names = {} if spec.names is None else io.load_names(scene.path(spec.names))
-    ids = {name: _id_of(name, scene, names) for name in scene.objects}
-    _check_ids(ids)
-    gaussians = io.load_gaussians(scene.path(spec.gaussians), drop_invalid=spec.drop_invalid, origin=spec.origin)
+    ids, names = read_ids(scene)
+    gaussians = _read_file(scene)
     views = None
     if spec.views is not None:
         masks = True if spec.masks is None else scene.path(spec.masks)
@@ -94,6 +101,53 @@ def read_inputs(scene: Scene) -> Inputs:
     if scene.camera.view is not None:
         _camera_of_view(scene.camera, views)
     return _placed_inputs(scene, Inputs(gaussians, views, ids, names))
+
+
+def read_ids(scene: Scene) -> tuple[dict[str, int], dict[int, str]]:
+    """Id of each object of the scene, and the names that `input.names` gives to ids.
+
+    Raises:
+        InputError: the file of names is missing or damaged.
+        SceneError: an object has no id of its own.
+    """
+    names = {} if scene.input.names is None else io.load_names(scene.path(scene.input.names))
+    ids = {name: _id_of(name, scene, names) for name in scene.objects}
+    _check_ids(ids)
+    return ids, names
+
+
+def read_gaussians(scene: Scene) -> Gaussians:
+    """Gaussians of the scene at rest, in the frame in which they are simulated.
+
+    Raises:
+        InputError: the file is missing or damaged.
+        SceneError: the scene's `[world]` holds no numbers yet.
+    """
+    return placed(_read_file(scene), matrix_of(scene.world))
+
+
+def _read_file(scene: Scene) -> Gaussians:
+    spec = scene.input
+    return io.load_gaussians(scene.path(spec.gaussians), drop_invalid=spec.drop_invalid, origin=spec.origin)
+
+
+def to_capture(scene: Scene) -> Float[np.ndarray, "4 4"]:
+    """Transform from the frame of the simulation back to that of the Gaussians' file, less `input.origin`.
+
+    Exports pass through it, so that they lie where the capture does.
+
+    Raises:
+        SceneError: the scene's `[world]` holds no numbers yet.
+    """
+    return np.linalg.inv(matrix_of(scene.world))
+
+
+def settled(scene: Scene, inputs: Inputs) -> Scene:
+    """The scene with the numbers of its `[world]` in place of "auto", "ground" and heights."""
+    if inputs.world is None:
+        return scene
+    objects = {name: msgspec.structs.replace(spec, height=None) for name, spec in scene.objects.items()}
+    return msgspec.structs.replace(scene, world=WorldSpec(**described(inputs.world)), objects=objects)
 
 
 def _id_of(name: str, scene: Scene, names: dict[int, str]) -> int:
@@ -212,15 +266,20 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         sleep=None if spec.sleep is None else Sleep(speed=spec.sleep),
         gravity=vector,
         config=SimConfig(kernel=spec.kernel, cfl=spec.cfl, integrator=spec.integrator),
-        clamp=ClampParams(
-            tau_min=jnp.asarray(scene.clamp.tau_min),
-            tau_max=jnp.asarray(scene.clamp.tau_max),
-            lambda_R=jnp.asarray(scene.clamp.lambda_R),
-            lambda_S=jnp.asarray(scene.clamp.lambda_S),
-            relative=scene.clamp.relative,
-        ),
+        clamp=clamp_params(scene.clamp),
         frame_dt=1 / (spec.fps * spec.slow_motion),
         labels=labels,
+    )
+
+
+def clamp_params(spec: ClampSpec) -> ClampParams:
+    """Bounds and weights of a scene's eigen-clamp."""
+    return ClampParams(
+        tau_min=jnp.asarray(spec.tau_min),
+        tau_max=jnp.asarray(spec.tau_max),
+        lambda_R=jnp.asarray(spec.lambda_R),
+        lambda_S=jnp.asarray(spec.lambda_S),
+        relative=spec.relative,
     )
 
 
@@ -327,7 +386,7 @@ def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
         settings.pop(name)
     if scene.output.compress_states:
         settings["output"] = {"compress_states": True}
-    for name in ("gaussians", "views", "images", "masks", "names"):
+    for name in INPUT_FILES:
         settings["input"].pop(name)
     views = inputs.views
     content = {

@@ -18,6 +18,7 @@ from pigjax import io
 from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.errors import SimulationError, StaleError
+from pigjax.core.linalg import safe_norm
 from pigjax.coupling.binding import deform
 from pigjax.mpm import Particles, vast_grid
 from pigjax.mpm.active_grid import ActiveGrid
@@ -26,15 +27,30 @@ from pigjax.mpm.sleep import Sleeper
 from pigjax.mpm.timestep import substep_rule
 from pigjax.objects.overlay import legend_sheet, overlay
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
-from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
+from pigjax.scene.plan import (
+    Inputs,
+    Plan,
+    make_cameras,
+    make_plan,
+    provenance,
+    read_inputs,
+    render_config,
+    segment,
+    settled,
+)
+from pigjax.scene.replay import COLLIDER_FILE, SCENE_FILE, rows_of, store_colliders
 from pigjax.scene.report import RunReport
-from pigjax.scene.schema import Scene
+from pigjax.scene.report_page import report_page
+from pigjax.scene.schema import Scene, values_of
 from pigjax.scene.world import described
 from pigjax.segmentation import Labels, pixel_ids
 from pigjax.splat import Gaussians, render
 
 _SHEET_FRAMES = 12
-_FILES = ("video.mp4", "contact_sheet.png", "objects.png", "labels.npz", "report.json")
+_FILES = (
+    "video.mp4", "contact_sheet.png", "objects.png", "labels.npz", COLLIDER_FILE, SCENE_FILE, "report.json",
+    "report.html",
+)  # fmt: skip
 Progress = Callable[[str, int, int], None]  # stage, done, of
 
 
@@ -45,7 +61,9 @@ def run_scene(
     """Simulate a scene and draw its video. Host.
 
     Into `out_dir` go `video.mp4`, `contact_sheet.png`, `objects.png` (the objects in their colours), `labels.npz`,
-    `states/<frame>.npz` (x, v and F_visual of every particle) and `report.json`. A run that was killed goes on from its
+    `colliders.npz` (of still objects), `states/<frame>.npz` (x, v and F_visual of every particle),
+    `states/particles.npz` (Gaussian, object, material, mass and rest volume of each), `scene.toml` (every setting, to
+    reproduce), `report.json` and the page `report.html`; `load_run` reads them. A run that was killed goes on from its
     last state; when all states are there, only the video is redrawn.
 
     Args:
@@ -68,16 +86,20 @@ def run_scene(
             _run(scene, out, report, tell, overwrite)
         except StaleError:
             raise  # report.json still tells of the results that are there
-        except BaseException:
-            _leave_report(report, caught, out)
+        except BaseException as error:
+            _leave_report(scene, report, caught, out, error=str(error) or type(error).__name__)
             raise
-        _leave_report(report, caught, out)
+        _leave_report(scene, report, caught, out)
     return report
 
 
-def _leave_report(report: RunReport, caught: list[warnings.WarningMessage], out: Path) -> None:
+def _leave_report(
+    scene: Scene, report: RunReport, caught: list[warnings.WarningMessage], out: Path, *, error: str | None = None
+) -> None:
     report.warnings += list(dict.fromkeys(str(w.message) for w in caught))
     io.write_json(out / "report.json", report.as_dict())
+    settings = io.toml_text(values_of(scene, out))
+    io.write_text(out / "report.html", report_page(scene, report, settings=settings, sheet=report.sheet, error=error))
 
 
 def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: bool) -> None:
@@ -102,6 +124,9 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: 
             labels.ids,
             scene=_mark(scene, inputs),
         )
+        io.save_rows(out / "states", rows_of(plan.particles, labels), signature=key)
+        store_colliders(out / COLLIDER_FILE, scene, plan.colliders)
+        io.write_toml(out / SCENE_FILE, values_of(settled(scene, inputs), out))
         tell("seed", 1, 1)
     _describe(scene, inputs, plan, labels, report)
     states = _simulate(scene, plan, out / "states", parts, key, report, tell)
@@ -291,15 +316,18 @@ def _draw(
     def pose_and_render(gaussians: Gaussians, particles: Particles, binding, camera: Camera):
         splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
         frame = render(splats, camera, config, background=background, outputs=("rgb",))
-        return jnp.clip(frame.rgb, 0, 1)
+        longest = safe_norm(splats.factors, axis=1) / jnp.exp(gaussians.log_scales)  # of each axis, relative to rest
+        return jnp.clip(frame.rgb, 0, 1), longest.max(1)
 
-    def draw(frame: int) -> jax.Array:
+    def draw(frame: int) -> tuple[jax.Array, jax.Array]:
         state = io.load_state(out / "states", frame, signature=key)
         particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, (state["x"], state["F_visual"]))
         return pose_and_render(gaussians, particles, plan.binding, cameras[frame])
 
     sheet_frames = np.unique(np.linspace(0, frames, _SHEET_FRAMES).round().astype(int))
     sheet: list[np.ndarray] = []
+    moving = np.isin(np.asarray(labels.object_id), [inputs.ids[n] for n, e in scene.objects.items() if not e.fixed])
+    stretches: dict[str, list[float]] = {"median": [], "99 of 100 below": [], "most": []}
 
     every, within = scene.output.states_every, report.times["draw"]
 
@@ -319,7 +347,10 @@ def _draw(
         for frame in range(frames + 1):
             there = there if there >= frame else wait_for(frame, there)
             tell("draw", frame, frames + 1)
-            picture = np.asarray(draw(frame))
+            picture, stretch = map(np.asarray, draw(frame))
+            record = np.quantile(stretch[moving], (0.5, 0.99, 1)) if moving.any() else np.ones(3)
+            for values, number in zip(stretches.values(), record.tolist()):
+                values.append(number)
             if not every or (frame % every and frame < frames):
                 io.remove_state(out / "states", frame)
             if frame in sheet_frames:
@@ -330,8 +361,11 @@ def _draw(
     tell("draw", frames + 1, frames + 1)
     wait_for(frames + 1, frames)  # for the health of the whole simulation
     if not every:
-        io.remove(out / "states" / "last.ckpt")
-    io.write_image(out / "contact_sheet.png", io.contact_sheet(sheet))
+        for name in ("last.ckpt", io.ROWS):
+            io.remove(out / "states" / name)
+    report.health["splat_stretch"] = stretches
+    report.sheet = io.contact_sheet(sheet)
+    io.write_image(out / "contact_sheet.png", report.sheet)
     _draw_objects(inputs, labels, cameras[0], sheet[0], out / "objects.png")
     for name in (*_FILES, "states"):
         report.files[name.split(".")[0]] = str(out / name)

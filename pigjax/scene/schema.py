@@ -8,7 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from msgspec import field
+from msgspec import field, to_builtins
 from msgspec.structs import asdict, replace
 
 from pigjax import io
@@ -33,6 +33,7 @@ _ANGLE = Limits(-1e6, 1e6, unit="degrees")
 _PIXELS = Limits(1, 16384, unit="px")
 _WEIGHT = Limits(-1e3, 1e3)
 _FRICTION = Limits(0, 1e6)
+INPUT_FILES = ("gaussians", "views", "images", "masks", "names")  # fields of `input` that hold paths
 
 
 class InputSpec(Section, frozen=True):
@@ -412,3 +413,24 @@ def scene_from(
     except SceneError as error:
         raise SceneError(f"{where}: {error}") from error.__cause__
     return scene
+
+
+def values_of(scene: Scene, folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """Contents of a scene file in another folder that asks for the same: every field with its value.
+
+    The level of accuracy is "standard", since the fields hold the values that another level gave them.
+    """
+    values: dict[str, Any] = _given(to_builtins(scene))
+    values.pop("folder")
+    values["accuracy"] = "standard"
+    for name in INPUT_FILES:
+        if name in values["input"]:
+            values["input"][name] = os.path.relpath(scene.path(values["input"][name]), folder)
+    return values
+
+
+def _given(value: Any) -> Any:
+    """Without fields that are None, for which TOML has no form."""
+    if not isinstance(value, dict):
+        return value
+    return {key: _given(entry) for key, entry in value.items() if entry is not None}

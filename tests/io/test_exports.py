@@ -6,6 +6,7 @@ import re
 import struct
 import zipfile
 from io import BytesIO
+from itertools import pairwise
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -183,11 +184,23 @@ def test_usd_has_a_time_sample_for_each_frame_that_moves(tmp_path, frames):
     for frame, splats in enumerate(still):
         np.testing.assert_array_equal(field.GetPositionsAttr().Get(frame), splats.means)
     turns = [np.asarray(field.GetOrientationsAttr().Get(frame)) for frame in range(4)]
-    assert all(((a * b).sum(1) >= 0).all() for a, b in zip(turns, turns[1:])), "the long way round between frames"
+    assert all(((a * b).sum(1) >= 0).all() for a, b in pairwise(turns)), "the long way round between frames"
     low, high = np.asarray(field.GetExtentAttr().Get(2))
     assert (low < frames[1].means.min(0)).all() and (high > frames[1].means.max(0)).all()  # noqa: PT018
     back = io.read_usd(tmp_path / "a.usdc", frame=2)
-    np.testing.assert_allclose(back["means"], np.asarray(frames[1].means) + [10, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(back["means"], frames[1].means + jnp.asarray([10.0, 0, 0]), atol=1e-6)
+
+
+def test_usd_that_draws_on_other_files_is_refused(tmp_path, frames):
+    pytest.importorskip("pxr")
+    io.save_usd(tmp_path / "a.usda", [frames[0]])
+    text = "#usda 1.0\n(\n    subLayers = [@./a.usda@]\n)\n"
+    (tmp_path / "b.usda").write_text(text)
+    with pytest.raises(InputError, match=r"b\.usda: draws on other files"):
+        io.load_gaussians(tmp_path / "b.usda")
+    (tmp_path / "c.usdc").write_bytes(b"PXR-USDC" + bytes(80))
+    with pytest.raises(InputError, match=r"c\.usdc: not a readable USD file"):
+        io.load_gaussians(tmp_path / "c.usdc")
 
 
 # ---- the page
@@ -375,7 +388,9 @@ def test_meshes_come_back(tmp_path, suffix):
             told = [gltf.accessors[i] for i in (mesh.primitives[0].attributes.POSITION, mesh.primitives[0].indices)]
             views = [gltf.bufferViews[accessor.bufferView] for accessor in told]
             points = np.frombuffer(blob, "<f4", 12, views[0].byteOffset).reshape(-1, 3)
-            parts.append((points, first + np.frombuffer(blob, "<u4", 12, views[1].byteOffset).reshape(-1, 3).astype(int)))
+            parts.append(
+                (points, first + np.frombuffer(blob, "<u4", 12, views[1].byteOffset).reshape(-1, 3).astype(int))
+            )
             first += len(points)
         vertices, faces = (np.concatenate(values) for values in zip(*parts))
     corners = vertices[faces]
