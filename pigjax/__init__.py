@@ -11,6 +11,7 @@ from pigjax.core.errors import InputError, MissingFileError, SceneError, Simulat
 from pigjax.core.metrics import boundary_iou, mean_iou, psnr, ssim
 from pigjax.core.placing import as_gaussians, placed
 from pigjax.core.regions import BoxRegion, HalfSpace, SphereRegion
+from pigjax.core.upright import Upright, find_up
 from pigjax.coupling.binding import at_frame, bind, deform
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
@@ -42,6 +43,7 @@ from pigjax.objects.evaluation import evaluate_labels
 from pigjax.reconstruction.prune import contributions, prune
 from pigjax.reconstruction.reconstruct import FitConfig, reconstruct
 from pigjax.scene import Run, RunReport, Scene, export_run, load_run, load_scene, run_scene
+from pigjax.scene.world import placed_cameras
 from pigjax.segmentation import Labels, fill_unseen, lift_masks, object_mask
 from pigjax.splat import (
     Frame,
@@ -100,6 +102,7 @@ __all__ = [
     "Spring",
     "Table",
     "Trajectory",
+    "Upright",
     "Views",
     "Wind",
     "as_gaussians",
@@ -119,6 +122,7 @@ __all__ = [
     "export_run",
     "extract_object",
     "fill_unseen",
+    "find_up",
     "fit",
     "fit_grid",
     "grab",
@@ -143,6 +147,7 @@ __all__ = [
     "orbit",
     "origin_of",
     "placed",
+    "placed_cameras",
     "preset",
     "prune",
     "psnr",

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.checks import Limits, shown
 from pigjax.core.errors import InputError, SceneError
@@ -74,8 +75,11 @@ def axis_of(up: str | tuple[float, float, float]) -> Float[np.ndarray, "3"]:
     return np.eye(3)["xyz".index(up[-1])] * (-1 if up.startswith("-") else 1)
 
 
+@checked
 def placed_cameras(cameras: Camera, transform: Float[np.ndarray, "4 4"]) -> Camera:
     """The cameras of a scene that is turned, scaled and shifted as a whole: they draw the same pictures.
+
+    `render(placed(gaussians, matrix), placed_cameras(camera, matrix))`
 
     Args:
         cameras: one, or a batch.
