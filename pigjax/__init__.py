@@ -6,6 +6,7 @@ Pipeline: files (`io`) → Gaussians (`reconstruction`, or a trained file) → o
 """
 
 from pigjax.clamp import ClampParams, eigen_clamp
+from pigjax.core import __version__ as __version__
 from pigjax.core.camera import Camera, interpolate_path, look_at, orbit, stack_cameras
 from pigjax.core.errors import InputError, MissingFileError, SceneError, SimulationError
 from pigjax.core.metrics import boundary_iou, mean_iou, psnr, ssim
@@ -56,9 +57,6 @@ from pigjax.splat import (
 )
 from pigjax.study import Experiment, experiment, load_study, sweep_study, tune_study
 from pigjax.study.optimize import Bounds, Table, fit, load_table, search, sweep
-
-__version__ = "0.1.0"
-
 
 __all__ = [
     "Association",

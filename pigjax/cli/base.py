@@ -44,15 +44,15 @@ Overwrite = Annotated[
 DropInvalid = Annotated[
     bool, typer.Option("--drop-invalid", help="Leave out Gaussians that hold NaN or infinity, with a warning.")
 ]
-Images = Annotated[
-    Path | None,
-    typer.Option("--images", metavar="DIR", help="Folder of the photos, if not the one that the cameras' file names."),
-]
 Changes = Annotated[
     list[str] | None,
     typer.Option(
         "--set", metavar="FIELD=VALUE", help="Replace a field of the file: --set simulation.frames=8; repeat it."
     ),
+]
+Images = Annotated[
+    Path | None,
+    typer.Option("--images", metavar="DIR", help="Folder of the photos, if not the one that the cameras' file names."),
 ]
 Origin = Annotated[
     tuple[float, float, float] | None,

@@ -30,7 +30,7 @@ from pigjax.io.formats import load_gaussians, origin_of, read_gaussians
 from pigjax.io.gltf import Mesh, save_glb, save_mesh
 from pigjax.io.images import contact_sheet, data_uri, read_image, write_image
 from pigjax.io.labels import StoredLabels, digest_of_scene, load_labels, save_labels
-from pigjax.io.masks import load_masks, save_masks
+from pigjax.io.masks import load_masks, load_stroke, save_masks
 from pigjax.io.page import save_page
 from pigjax.io.ply import load_ply, load_points, read_ply, save_ply
 from pigjax.io.points import save_points
@@ -87,6 +87,7 @@ __all__ = [
     "load_pytree",
     "load_rows",
     "load_state",
+    "load_stroke",
     "load_views",
     "origin_of",
     "output_folder",

@@ -22,8 +22,9 @@ from pigjax.core.errors import InputError
 from pigjax.core.gaussians import SH_CONSTANT
 from pigjax.core.placing import as_gaussians, placed, points_placed, up_to
 from pigjax.coupling.surfaces import Surface, collider_surface, matter_surface
-from pigjax.scene.plan import axis_of, render_config, to_capture
+from pigjax.scene.plan import render_config
 from pigjax.scene.replay import Run, load_run
+from pigjax.scene.world import axis_of
 from pigjax.splat import Gaussians, Splats, render
 from pigjax.splatting.types import extent_of
 
@@ -53,14 +54,14 @@ class _Job:
 
     def splats(self, transform: Float[np.ndarray, "4 4"] | None = None) -> Iterator[Gaussians]:
         """The exported splats of each frame where the capture lies, and then placed by the transform."""
-        there = to_capture(self.run.scene)
+        there = self.run.to_capture
         whole = there if transform is None else np.einsum("ij,jk->ik", transform, there)
         for frame in self.each():
             yield placed(_rows_of(self.run.splats(frame), self.rows), whole)
 
     def points(self, x: np.ndarray) -> np.ndarray:
         """Positions where the capture lies [m], in single precision."""
-        return points_placed(x, to_capture(self.run.scene)).astype(np.float32)
+        return points_placed(x, self.run.to_capture).astype(np.float32)
 
     def path(self, folder: str, frame: int, suffix: str) -> Path:
         """File of a frame."""
@@ -163,7 +164,7 @@ def _ply(job: _Job) -> list[Path]:
 
 
 def _glb(job: _Job) -> list[Path]:
-    turn = up_to(axis_of(job.run.scene.input.up), _Y)
+    turn = up_to(job.run.up, _Y)
     paths = [job.path("glb", frame, "glb") for frame in job.frames]
     origin = None if job.origin is None else points_placed(np.asarray(job.origin)[None], turn)[0]
     for path, gaussians in zip(paths, job.splats(turn)):
@@ -172,11 +173,11 @@ def _glb(job: _Job) -> list[Path]:
 
 
 def _usd(job: _Job) -> list[Path]:
-    path, up = job.out / "splats.usdc", job.run.scene.input.up
-    turn = np.eye(4) if up in ("y", "z") else up_to(axis_of(up), _Z)
+    path, up = job.out / "splats.usdc", job.run.up
+    axis = next((name for name, unit in (("Y", _Y), ("Z", _Z)) if np.allclose(up, unit)), None)
+    turn = np.eye(4) if axis else up_to(up, _Z)
     origin = None if job.origin is None else points_placed(np.asarray(job.origin)[None], turn)[0]
-    axis = up.upper() if up in ("y", "z") else "Z"
-    io.save_usd(path, job.splats(turn), fps=job.run.scene.simulation.fps, up=axis, origin=origin)
+    io.save_usd(path, job.splats(turn), fps=job.run.scene.simulation.fps, up=axis or "Z", origin=origin)
     return [path]
 
 
@@ -229,7 +230,7 @@ def _vtk(job: _Job) -> list[Path]:
 
 def _surface(job: _Job) -> list[Path]:
     names = {number: name for name, number in job.run.ids.items()}
-    rows, spacing = job.run.rows, job.run.scene.simulation.dx / 2
+    rows, spacing = job.run.rows, job.run.dx / 2
     colours = {number: _colour_of(job.run.gaussians, job.run.object_id == number) for number in job.objects}
     paths = [job.path("surface", frame, job.mesh) for frame in job.frames]
     for path, frame in zip(paths, job.each()):
@@ -262,10 +263,10 @@ def _colliders(job: _Job) -> list[Path]:
 
 def _mesh(job: _Job, surface: Surface, colour: tuple[float, float, float] = (0.7, 0.7, 0.7)) -> io.Mesh:
     """A mesh where its splats are exported: in `.glb` with y up, in `.obj` where the capture lies."""
-    vertices = points_placed(surface.vertices, to_capture(job.run.scene))
+    vertices = points_placed(surface.vertices, job.run.to_capture)
     vertices = vertices if job.origin is None else vertices + np.asarray(job.origin)
     if job.mesh == "glb":
-        vertices = points_placed(vertices, up_to(axis_of(job.run.scene.input.up), _Y))
+        vertices = points_placed(vertices, up_to(job.run.up, _Y))
     return io.Mesh(vertices, surface.faces, colour)
 
 

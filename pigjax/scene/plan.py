@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from pigjax import io
 from pigjax.clamp import ClampParams
 from pigjax.core.camera import Camera, orbit, stack_cameras
-from pigjax.core.checks import suggest
+from pigjax.core.checks import joined, suggest
 from pigjax.core.errors import SceneError
 from pigjax.core.placing import placed
+from pigjax.core.regions import Region
 from pigjax.coupling.binding import Binding, bind
+from pigjax.coupling.outliers import cut_outliers, told
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
 from pigjax.mls_mpm import SimConfig
@@ -29,21 +33,16 @@ from pigjax.mpm.forces import Force
 from pigjax.mpm.materials import Material, MaterialTable
 from pigjax.mpm.sleep import Sleep
 from pigjax.objects.lifting import lift
+from pigjax.scene.advice import default_dx, remarks_on
 from pigjax.scene.forces import forces_of
+from pigjax.scene.framing import framing_camera
 from pigjax.scene.schema import INPUT_FILES, CameraSpec, ClampSpec, Scene, SimulationSpec
-from pigjax.scene.world import (
-    WorldSpec,
-    axis_of,
-    described,
-    file_to_world,
-    height_of,
-    matrix_of,
-    metres_of,
-    placed_cameras,
-)
-from pigjax.segmentation import Labels
+from pigjax.scene.world import WorldSpec, axis_of, file_to_world, height_of, metres_of, placed_cameras
+from pigjax.segmentation import Labels, fill_unseen
 from pigjax.splat import Gaussians, RenderConfig
 from pigjax.splatting.types import extent_of
+
+_FRAMED = 0.98  # share of the moving matter that the default orbit frames
 
 
 @dataclass
@@ -54,8 +53,16 @@ class Inputs:
     views: io.Views | None
     ids: dict[str, int]  # id of each object of the scene
     names: dict[int, str]  # names that `input.names` gives to ids
+    stored: io.StoredLabels | None = None  # of `input.labels`
+    own: dict[str, Gaussians] = field(default_factory=dict)  # of the objects that have a file of their own
     world: Float[np.ndarray, "4 4"] | None = None  # transform from the files; None: none
     labels: Labels | None = None  # where the scale of the world needed them
+    arranged: bool = False  # whether objects were placed, copied or removed
+
+    @property
+    def moved(self) -> bool:
+        """Whether the Gaussians are not as their file has them."""
+        return self.arranged or self.world is not None
 
 
 @dataclass
@@ -73,47 +80,58 @@ class Plan:
     config: SimConfig
     clamp: ClampParams
     frame_dt: float  # [s]
+    dx: float  # grid spacing [m]
+    pins: tuple[Region, ...]
+    starts: tuple[int, ...]  # frame with which each row of the table begins to move
+    remarks: list[str]  # on the scene as a whole, each with its remedy
     labels: Labels  # Gaussians buried in still objects belong to these
 
 
 def read_inputs(scene: Scene) -> Inputs:
-    """Read Gaussians, views and names.
+    """Read Gaussians, views, labels and names.
 
     Raises:
-        InputError: a file is missing or damaged.
+        InputError: a file is missing or damaged, or labels other Gaussians.
         SceneError: an object has no id of its own, or `camera.view` is not the name of a photo.
     """
     spec = scene.input
-    ids, names = read_ids(scene)
-    gaussians = _read_file(scene)
+    names = {} if spec.names is None else io.load_names(scene.path(spec.names))
+    known = {name: _id_of(name, scene, names) for name in scene.objects}
+    _check_ids({name: number for name, number in known.items() if number is not None})
+    gaussians = read_gaussians(scene)
     views = None
     if spec.views is not None:
         masks = True if spec.masks is None else scene.path(spec.masks)
         photos = None if spec.images is None else scene.path(spec.images)
         views = io.load_views(
-            scene.path(spec.views),
-            images=photos,
-            masks=masks,
-            missing_masks="abstain",
-            max_size=spec.max_size,
+            scene.path(spec.views), images=photos, masks=masks, missing_masks="abstain", max_size=spec.max_size,
             origin=spec.origin,
-        )
+        )  # fmt: skip
     if scene.camera.view is not None:
         _camera_of_view(scene.camera, views)
-    return _placed_inputs(scene, Inputs(gaussians, views, ids, names))
+    stored = None
+    if spec.labels is not None:
+        mark = None if spec.origin is not None else io.digest_of_scene(gaussians)
+        stored = io.load_labels(scene.path(spec.labels), len(gaussians), scene=mark)
+    own = {
+        name: io.load_gaussians(scene.path(entry.gaussians), drop_invalid=spec.drop_invalid)
+        for name, entry in scene.objects.items()
+        if entry.gaussians is not None
+    }
+    return _placed_inputs(scene, Inputs(gaussians, views, _numbered(known, names, views, stored), names, stored, own))
 
 
-def read_ids(scene: Scene) -> tuple[dict[str, int], dict[int, str]]:
-    """Id of each object of the scene, and the names that `input.names` gives to ids.
-
-    Raises:
-        InputError: the file of names is missing or damaged.
-        SceneError: an object has no id of its own.
-    """
-    names = {} if scene.input.names is None else io.load_names(scene.path(scene.input.names))
-    ids = {name: _id_of(name, scene, names) for name in scene.objects}
-    _check_ids(ids)
-    return ids, names
+def _numbered(
+    known: dict[str, int | None], names: dict[int, str], views: io.Views | None, stored: io.StoredLabels | None
+) -> dict[str, int]:
+    """Ids of all objects; those that nothing numbers get new ones."""
+    taken = [0, *names, *(number for number in known.values() if number is not None)]
+    if views is not None and views.masks is not None:
+        taken.append(int(np.max(views.masks)))
+    if stored is not None:
+        taken.append(int(stored.object_id.max(initial=0)))
+    free = itertools.count(max(taken) + 1)
+    return {name: next(free) if number is None else number for name, number in known.items()}
 
 
 def read_gaussians(scene: Scene) -> Gaussians:
@@ -121,41 +139,19 @@ def read_gaussians(scene: Scene) -> Gaussians:
 
     Raises:
         InputError: the file is missing or damaged.
-        SceneError: the scene's `[world]` holds no numbers yet.
     """
-    return placed(_read_file(scene), matrix_of(scene.world))
-
-
-def _read_file(scene: Scene) -> Gaussians:
     spec = scene.input
     return io.load_gaussians(scene.path(spec.gaussians), drop_invalid=spec.drop_invalid, origin=spec.origin)
 
 
-def to_capture(scene: Scene) -> Float[np.ndarray, "4 4"]:
-    """Transform from the frame of the simulation back to that of the Gaussians' file, less `input.origin`.
-
-    Exports pass through it, so that they lie where the capture does.
-
-    Raises:
-        SceneError: the scene's `[world]` holds no numbers yet.
-    """
-    return np.linalg.inv(matrix_of(scene.world))
-
-
-def settled(scene: Scene, inputs: Inputs) -> Scene:
-    """The scene with the numbers of its `[world]` in place of "auto", "ground" and heights."""
-    if inputs.world is None:
-        return scene
-    objects = {name: msgspec.structs.replace(spec, height=None) for name, spec in scene.objects.items()}
-    return msgspec.structs.replace(scene, world=WorldSpec(**described(inputs.world)), objects=objects)
-
-
-def _id_of(name: str, scene: Scene, names: dict[int, str]) -> int:
-    own = scene.objects[name].id
-    if own is not None:
-        return own
+def _id_of(name: str, scene: Scene, names: dict[int, str]) -> int | None:
+    """The id that the scene or its names give to an object; None for one that neither masks nor labels show."""
+    entry = scene.objects[name]
+    if entry.id is not None or entry.gaussians is not None:
+        return entry.id
     found = io.id_named(name, names)
-    if found is None:
+    chosen = entry.within is not None or (scene.input.views is None and scene.input.labels is None)
+    if found is None and not chosen:
         remedy = suggest(name, list(names.values())) if names else f"give objects.{name}.id, or input.names"
         raise SceneError(f"objects.{name}: no object of that name in {scene.input.names or 'input.names'}; {remedy}.")
     return found
@@ -170,23 +166,66 @@ def _check_ids(ids: dict[str, int]) -> None:
 
 
 def segment(scene: Scene, inputs: Inputs) -> Labels:
-    """Objects of the Gaussians, by the masks; without masks all belong to the only object.
+    """Objects of the Gaussians: by `input.labels` or by the masks, without both all belong to the only object.
+
+    Regions of objects (`within`) overrule both.
 
     Raises:
         SceneError: no Gaussian belongs to an object.
     """
     if inputs.labels is not None:
         return inputs.labels
+    regions = {
+        name: entry.within.to_region(joined("objects", name, "within"))
+        for name, entry in scene.objects.items()
+        if entry.within is not None
+    }
+    asked = {name: k for name, k in inputs.ids.items() if name not in regions and name not in inputs.own}
+    if inputs.stored is not None:
+        labels = _stored(scene, inputs, asked)
+    elif inputs.views is not None:
+        labels = _lifted(scene, inputs, asked)
+    else:
+        labels = _one_object(inputs, next(iter(asked.values()), 0))
+    for name, region in regions.items():
+        mine = np.asarray(region.contains(inputs.gaussians.means))
+        if not mine.any():
+            raise SceneError(f"{joined('objects', name, 'within')}: no Gaussian has its centre there; move it.")
+        labels = with_id(labels, mine, inputs.ids[name])
+    for name, number in inputs.ids.items():
+        if name not in inputs.own and not np.any(np.asarray(labels.object_id) == number):
+            raise SceneError(f"objects.{name}: other objects took all its Gaussians; check objects.<name>.within.")
+    if inputs.stored is not None or inputs.views is not None:
+        found = np.unique(np.maximum(labels.object_id, 0))
+        _warn_of_unnamed(inputs, found[found > 0])
+    return labels
+
+
+def _one_object(inputs: Inputs, number: int) -> Labels:
+    total = len(inputs.gaussians)
+    ids = jnp.asarray(sorted({0, number}), jnp.int32)
+    votes = jnp.zeros((total, len(ids)), jnp.int32)
+    return Labels(jnp.full(total, number, jnp.int32), votes, jnp.ones(total), ids=ids)
+
+
+def _stored(scene: Scene, inputs: Inputs, asked: dict[str, int]) -> Labels:
+    stored = inputs.stored
+    assert stored is not None
+    own, votes, confidence = map(jnp.asarray, stored[:3])
+    labels = Labels(own, votes, confidence, ids=None if stored.ids is None else jnp.asarray(stored.ids))
+    for name, number in asked.items():
+        if not np.any(stored.object_id == number):
+            path, there = scene.input.labels, np.unique(stored.object_id[stored.object_id > 0]).tolist()
+            raise SceneError(f"objects.{name}: no Gaussian has its id {number} in {path}, which holds {there}.")
+    return fill_unseen(inputs.gaussians, labels) if scene.segmentation.fill_unseen else labels
+
+
+def _lifted(scene: Scene, inputs: Inputs, asked: dict[str, int]) -> Labels:
     spec = scene.segmentation
-    if inputs.views is None:
-        (only,) = inputs.ids.values()
-        count = len(inputs.gaussians)
-        ids = jnp.asarray(sorted({0, only}), jnp.int32)
-        votes = jnp.zeros((count, len(ids)), jnp.int32)
-        return Labels(jnp.full(count, only, jnp.int32), votes, jnp.ones(count), ids=ids)
+    assert inputs.views is not None
     views = inputs.views.voters
     assert views.masks is not None
-    check_ids_occur(inputs.ids, views.masks)
+    check_ids_occur(asked, views.masks)
     labels = lift(
         inputs.gaussians,
         views.cameras,
@@ -198,10 +237,9 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
         valid=views.valid,
     )
     found = np.unique(np.maximum(labels.object_id, 0))
-    for name, number in inputs.ids.items():
+    for name, number in asked.items():
         if number not in found:
             raise SceneError(f"objects.{name}: no Gaussian has its id {number} in the masks; check input.masks.")
-    _warn_of_unnamed(inputs, found[found > 0])
     return labels
 
 
@@ -237,8 +275,11 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         SceneError: something of the scene cannot be simulated, named by its field.
     """
     spec = scene.simulation
-    solids = _still_solids(scene, inputs, labels)
-    labels = _without_buried(inputs, labels, solids, spec.dx)
+    keep = {inputs.ids[name]: entry.keep for name, entry in scene.objects.items()}
+    labels, cut = cut_outliers(inputs.gaussians, labels, keep)
+    dx = spec.dx or default_dx(scene, inputs.gaussians, labels, inputs.ids)
+    solids = _still_solids(scene, inputs, labels, dx)
+    labels = _without_buried(inputs, labels, solids, dx)
     moving = {name: entry for name, entry in scene.objects.items() if not entry.fixed}
     materials: dict[int, Material] = {inputs.ids[name]: entry.to_material(name) for name, entry in moving.items()}
     colliders = (*solids.values(), *scene.colliders())
@@ -247,8 +288,9 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         labels,
         materials,
         fill=spec.fill,
-        spacing=spec.dx,
+        spacing=dx,
         velocities={inputs.ids[name]: entry.velocity for name, entry in moving.items()},
+        spins={inputs.ids[name]: e.angular_velocity for name, e in moving.items() if any(e.angular_velocity)},
         particles_per_cell=spec.particles_per_cell,
         colliders=colliders,
         seed=spec.seed,
@@ -256,6 +298,8 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
     binding = bind(inputs.gaussians, labels, particles)
     gravity = spec.gravity
     vector = np.array(gravity) if isinstance(gravity, tuple) else -gravity * axis_of(scene.input.up)
+    frame_dt = 1 / (spec.fps * spec.slow_motion)
+    lost = told(cut, {number: name for name, number in inputs.ids.items()})
     return Plan(
         particles=particles,
         table=table,
@@ -267,7 +311,11 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         gravity=vector,
         config=SimConfig(kernel=spec.kernel, cfl=spec.cfl, integrator=spec.integrator),
         clamp=clamp_params(scene.clamp),
-        frame_dt=1 / (spec.fps * spec.slow_motion),
+        frame_dt=frame_dt,
+        dx=dx,
+        pins=scene.pins(),
+        starts=tuple(math.ceil(entry.start / frame_dt - 1e-9) for entry in moving.values()),
+        remarks=[*lost, *remarks_on(scene, particles, table, vector, dx)],
         labels=labels,
     )
 
@@ -289,7 +337,7 @@ def _contact(spec: SimulationSpec, bodies: int) -> BodyContact | None:
     return BodyContact(bodies=bodies, friction=jnp.asarray(spec.contact_friction))
 
 
-def _still_solids(scene: Scene, inputs: Inputs, labels: Labels) -> dict[str, Collider]:
+def _still_solids(scene: Scene, inputs: Inputs, labels: Labels, dx: float) -> dict[str, Collider]:
     object_id = np.asarray(labels.object_id)
     solids: dict[str, Collider] = {}
     for name, entry in scene.objects.items():
@@ -298,13 +346,30 @@ def _still_solids(scene: Scene, inputs: Inputs, labels: Labels) -> dict[str, Col
             own = jax.tree.map(lambda values, members=members: values[members], inputs.gaussians)
             solids[name] = collider_from_gaussians(
                 own,
-                spacing=scene.simulation.dx / 2,
+                spacing=dx / 2,
                 up=axis_of(scene.input.up),
                 others=np.delete(np.asarray(inputs.gaussians.means), members, axis=0),
                 friction=entry.friction,
                 name=f"objects.{name}",
             )
     return solids
+
+
+def with_id(labels: Labels, mine: Bool[np.ndarray, "n"], number: int) -> Labels:
+    """Labels in which some Gaussians have an id, which gets a column of votes where it has none."""
+    columns = np.arange(labels.votes.shape[1]) if labels.ids is None else np.asarray(labels.ids)
+    votes = np.asarray(labels.votes)
+    if number not in columns:
+        order = np.argsort(np.append(columns, number), kind="stable")
+        columns = np.append(columns, number)[order]
+        votes = np.pad(votes, ((0, 0), (0, 1)))[:, order]
+    return replace(
+        labels,
+        object_id=jnp.asarray(np.where(mine, number, np.asarray(labels.object_id)), jnp.int32),
+        votes=jnp.asarray(votes),
+        confidence=jnp.asarray(np.where(mine, 1, np.asarray(labels.confidence))),
+        ids=jnp.asarray(columns, jnp.int32),
+    )
 
 
 def _without_buried(inputs: Inputs, labels: Labels, solids: dict[str, Collider], dx: float) -> Labels:
@@ -319,13 +384,17 @@ def _without_buried(inputs: Inputs, labels: Labels, solids: dict[str, Collider],
     return labels
 
 
-def make_cameras(scene: Scene, inputs: Inputs, focus: Float[np.ndarray, "3"]) -> Camera:
+def make_cameras(
+    scene: Scene, inputs: Inputs, focus: Float[np.ndarray, "3"], matter: Float[np.ndarray, "p 3"] | None = None
+) -> Camera:
     """Batch of one camera for each frame of the video.
 
     Args:
         scene: its `camera` section.
         inputs: its views, for `camera.view`.
         focus: centre of the orbit where the scene names none [m].
+        matter: positions of the moving objects [m], which a training view frames where there are photos and the scene
+            says nothing of the camera.
 
     Raises:
         SceneError: `camera.view` is not the name of a photo.
@@ -334,9 +403,16 @@ def make_cameras(scene: Scene, inputs: Inputs, focus: Float[np.ndarray, "3"]) ->
     width, height = (max(round(side * scene.drawing.scale), 1) for side in (spec.width, spec.height))
     if spec.view is not None:
         return stack_cameras([_camera_of_view(spec, inputs.views).resized(width, height)] * frames)
+    if inputs.views is not None and matter is not None and spec.is_open:
+        framed = framing_camera(inputs.views, matter, width, height)
+        if framed is not None:
+            return stack_cameras([framed] * frames)
     target = np.array(spec.target) if spec.target is not None else focus
     focal = width / (2 * np.tan(np.radians(spec.field_of_view) / 2))
     radius = spec.radius if spec.radius is not None else _default_radius(inputs.gaussians, target)
+    if spec.radius is None and matter is not None:  # from so far that all of the moving objects fits in
+        fits = np.quantile(np.linalg.norm(matter - target, axis=1), _FRAMED)
+        radius = max(radius, float(fits) / np.sin(np.arctan(min(width, height) / (2 * focal))))
     return orbit(
         target,
         radius=radius,
@@ -395,6 +471,8 @@ def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
         "photos": None if views is None else (views.images, views.names, views.splits),
         "masks": None if views is None else views.masks if views.valid is None else (views.masks, views.valid),
         "ids of the objects": inputs.ids,
+        "labels": inputs.stored,
+        "Gaussians of objects": inputs.own,
     }
     digests = {name: io.digest(value) for name, value in content.items()}
     return io.parts_of({"": settings, "input files": digests, "precision": str(jnp.result_type(float))})

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from pigjax import io
 from pigjax.clamp import ClampParams
@@ -21,14 +21,15 @@ from pigjax.core.errors import InputError, MissingFileError
 from pigjax.coupling.binding import Binding, bind, deform
 from pigjax.mpm import Particles
 from pigjax.mpm.colliders import Collider, SampledDistance
-from pigjax.scene.plan import Inputs, clamp_params, make_cameras, read_gaussians, read_ids, read_inputs
+from pigjax.scene.plan import Inputs, clamp_params, make_cameras, read_gaussians, read_inputs
 from pigjax.scene.schema import Scene, load_scene
-from pigjax.scene.world import WorldSpec
+from pigjax.scene.world import axis_of
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, Splats
 
 SCENE_FILE = "scene.toml"  # settings of the run, in its folder
 COLLIDER_FILE = "colliders.npz"  # sampled distances of still objects
+REST_FILE = "rest.npz"  # ids of the objects, the world's transform, and the Gaussians at rest where they were moved
 _ROWS = ("gaussian", "material", "body", "mass", "volume0")
 
 
@@ -61,6 +62,25 @@ def store_colliders(path: str | os.PathLike[str], scene: Scene, colliders: Seque
     io.save_arrays(path, arrays)
 
 
+def store_rest(path: str | os.PathLike[str], inputs: Inputs, dx: float) -> None:
+    """Write ids of objects, the transform from the files to the world, and Gaussians that are not as in their file.
+
+    Args:
+        path: of the file.
+        inputs: of the run.
+        dx: grid spacing of the run [m].
+    """
+    arrays = {
+        "names": np.asarray(list(inputs.ids), str),
+        "ids": np.asarray(list(inputs.ids.values()), np.int64),
+        "dx": np.asarray(dx),
+        "world": np.eye(4) if inputs.world is None else np.asarray(inputs.world, float),
+    }
+    if inputs.moved:
+        arrays |= {field.name: np.asarray(getattr(inputs.gaussians, field.name)) for field in fields(Gaussians)}
+    io.save_arrays(path, arrays)
+
+
 @dataclass
 class Run:
     """A finished or running run: what its folder holds, posed on demand."""
@@ -72,8 +92,24 @@ class Run:
     ids: dict[str, int]  # id of each object of the scene, by name
     rows: dict[str, np.ndarray]  # of each particle: gaussian, object, material, body, mass [kg], volume0 [m³]
     frames: list[int]  # with a state on disk
+    dx: float  # grid spacing [m]
+    world: Float[np.ndarray, "4 4"]  # transform from the files to the frame of the simulation
     clamp: ClampParams = field(repr=False)  # with which splats are posed; `dataclasses.replace` takes another
     mode: str = "aligned"  # of the clamp
+
+    @property
+    def to_capture(self) -> Float[np.ndarray, "4 4"]:
+        """Transform from the frame of the simulation back to that of the Gaussians' file, less `input.origin`.
+
+        Exports pass through it, so that they lie where the capture does.
+        """
+        return np.linalg.inv(self.world)
+
+    @property
+    def up(self) -> Float[np.ndarray, "3"]:
+        """Unit vector that points up in the frame of the Gaussians' file."""
+        turned = np.einsum("ji,j->i", self.world[:3, :3], axis_of(self.scene.input.up))
+        return turned / np.linalg.norm(turned)
 
     @cached_property
     def rest(self) -> Particles:
@@ -180,19 +216,25 @@ def load_run(folder: str | os.PathLike[str], *, scene: Scene | None = None) -> R
     rows = io.load_rows(folder / "states")
     if missing := [name for name in (*_ROWS, "object") if name not in rows]:
         raise InputError(f"{folder / 'states' / io.ROWS}: has no {missing[0]}; run the scene again.")
-    gaussians = read_gaussians(scene)
-    moved = scene.input.origin is not None or scene.world != WorldSpec()
-    mark = None if moved else io.digest_of_scene(gaussians)
+    stored = io.load_arrays(folder / REST_FILE, "file of a run's rest state", remedy="run the scene again")
+    moved = "means" in stored
+    gaussians = _gaussians_of(stored) if moved else read_gaussians(scene)
+    mark = None if moved or scene.input.origin is not None else io.digest_of_scene(gaussians)
     labels = io.load_labels(folder / "labels.npz", count=len(gaussians), scene=mark)
-    ids, _ = read_ids(scene)
     return Run(
         folder=folder,
         scene=scene,
         gaussians=gaussians,
         object_id=np.asarray(labels.object_id),
-        ids=ids,
+        ids=dict(zip(stored["names"].tolist(), stored["ids"].tolist())),
         rows=rows,
         frames=frames,
+        dx=float(stored["dx"]),
+        world=stored["world"],
         clamp=clamp_params(scene.clamp),
         mode=scene.clamp.mode,
     )
+
+
+def _gaussians_of(stored: dict[str, np.ndarray]) -> Gaussians:
+    return Gaussians(**{column.name: jnp.asarray(stored[column.name]) for column in fields(Gaussians)})

@@ -36,6 +36,7 @@ class StageTime:
 class RunReport:
     """Result of `run_scene`, written as `report.json` and shown by `report.html`."""
 
+    plan: str = ""  # the work in one line: particles, grid, frames, time expected
     modelled: dict[str, Any] = field(default_factory=dict)  # laws, colliders, kernel, ... that the scene traced
     sizes: dict[str, Any] = field(default_factory=dict)  # counts of Gaussians, particles, frames, substeps; mass [kg]
     times: dict[str, StageTime] = field(default_factory=dict)  # by stage

@@ -141,19 +141,6 @@ def height_of(gaussians: Gaussians, members: Int[np.ndarray, "m"], up: Float[np.
     return float(high - low)
 
 
-def matrix_of(spec: WorldSpec) -> Float[np.ndarray, "4 4"]:
-    """The transform of a `[world]` table of numbers.
-
-    Raises:
-        SceneError: it asks for "auto" or "ground", which need the scene's files.
-    """
-    if spec.up == "auto" or spec.origin == "ground":
-        asked = "world.up = 'auto'" if spec.up == "auto" else "world.origin = 'ground'"
-        raise SceneError(f"{asked}: is not resolved here; write the numbers that pigjax info and report.json tell.")
-    origin = np.asarray(spec.origin or (0.0, 0.0, 0.0), np.float64)
-    return _matrix(None if spec.up is None else axis_of(spec.up), origin, spec.units_per_metre)
-
-
 def _matrix(
     up: Float[np.ndarray, "3"] | None, origin: Float[np.ndarray, "3"], units: float | None
 ) -> Float[np.ndarray, "4 4"]:
