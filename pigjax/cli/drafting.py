@@ -9,7 +9,6 @@ from pigjax import io
 from pigjax.core.errors import InputError
 from pigjax.io.finding import Found
 from pigjax.scene.draft import Draft, draft_scene, thumbnails
-from pigjax.splat import Gaussians
 
 # every name that the commands below show is a folder of the user's, in quotes for a shell
 MASK_LAYOUT = "object_mask/<photo's name>.png with 8- or 16-bit ids: 0 background, one id an object in all photos"
@@ -30,21 +29,17 @@ def write_draft(found: Found, folder: Path, *, up: str | None, ask: Callable[[st
     if (splats := found.gaussians) is None:
         raise InputError("a draft needs trained splats.")
 
-    def drafted(up: str | None) -> tuple[Draft, Gaussians, io.Views | None]:
+    def drafted(up: str | None) -> Draft:
         return draft_scene(
             splats, folder, views_path=found.views, masks_path=found.masks, names_path=found.names, up=up
         )
 
-    draft, gaussians, views = drafted(up)
+    draft = drafted(up)
     if ask is not None and (answer := ask(draft.up)) != draft.up:
-        draft, gaussians, views = drafted(answer)
-    if draft.labels is not None:
-        labels = draft.labels
-        io.save_labels(
-            folder / "labels.npz", labels.object_id, labels.votes, labels.confidence,
-            scene=io.digest_of_scene(gaussians),
-        )  # fmt: skip
-    for name, picture in thumbnails(gaussians, draft.parts, views, draft.up).items():
+        draft = drafted(answer)
+    if (labels := draft.labels) is not None:
+        io.save_labels(folder / "labels.npz", labels.object_id, labels.votes, labels.confidence, scene=draft.mark)
+    for name, picture in thumbnails(draft).items():
         io.write_image(folder / "thumbnails" / f"{io.safe_name(name)}.png", picture)
     io.write_text(folder / "scene.toml", draft.text)
     return draft

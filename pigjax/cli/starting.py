@@ -11,7 +11,7 @@ import typer
 from pigjax.cli.base import Overwrite, app, console, one_device_per_core, output_path, said
 from pigjax.core.errors import InputError
 
-_UP = "Axis that points up: x, y, z, -x, -y, -z; from the cameras or the ground if not given."
+_UP = "Direction that points up: x, y, z, -x, -y, -z, or 'X Y Z'; from cameras or ground if not given."
 
 
 @app.command()
@@ -74,5 +74,5 @@ def new(
 
 
 def _ask(guess: str) -> str:
-    """The axis that points up, from who sits at the terminal."""
-    return typer.prompt("Which axis points up (x, y, z, -x, -y, -z)?", default=guess, err=True)
+    """The direction that points up, from who sits at the terminal."""
+    return typer.prompt("Which direction points up (x, y, z, -x, -y, -z, or three numbers)?", default=guess, err=True)

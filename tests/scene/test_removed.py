@@ -23,7 +23,7 @@ def test_a_removed_object_leaves_its_place(tmp_path):
     np.testing.assert_array_equal(rest.gaussians.means, means[means[:, 2] < 0.3])
     assert len(labels.object_id) == len(rest.gaussians)
     plan = make_plan(after, rest, labels)
-    assert float(plan.particles.x[:, 2].max()) < 0.31
+    assert float(plan.particles.x[:, 2].max()) < 0.4  # the open top is closed by a cap; the whole ball ends at 0.5
     carried = np.asarray(plan.particles.gaussian)
     assert carried.max() < len(rest.gaussians)
 
