@@ -12,6 +12,7 @@ from pigjax.core.errors import InputError, MissingFileError, SceneError, Simulat
 from pigjax.core.metrics import boundary_iou, mean_iou, psnr, ssim
 from pigjax.core.placing import as_gaussians, placed
 from pigjax.core.regions import BoxRegion, HalfSpace, SphereRegion
+from pigjax.core.upright import Upright, find_up
 from pigjax.coupling.binding import at_frame, bind, deform
 from pigjax.coupling.outliers import cut_outliers
 from pigjax.coupling.sdf_collider import collider_from_gaussians
@@ -45,6 +46,7 @@ from pigjax.objects.selection import grow_selection, select_colour, select_part,
 from pigjax.reconstruction.prune import contributions, prune
 from pigjax.reconstruction.reconstruct import FitConfig, reconstruct
 from pigjax.scene import Run, RunReport, Scene, export_run, load_run, load_scene, run_scene
+from pigjax.scene.world import placed_cameras
 from pigjax.segmentation import Labels, fill_unseen, lift_masks, object_mask
 from pigjax.splat import (
     Frame,
@@ -100,6 +102,7 @@ __all__ = [
     "Spring",
     "Table",
     "Trajectory",
+    "Upright",
     "Views",
     "Wind",
     "as_gaussians",
@@ -120,6 +123,7 @@ __all__ = [
     "export_run",
     "extract_object",
     "fill_unseen",
+    "find_up",
     "fit",
     "fit_grid",
     "grab",
@@ -145,6 +149,7 @@ __all__ = [
     "orbit",
     "origin_of",
     "placed",
+    "placed_cameras",
     "preset",
     "prune",
     "psnr",

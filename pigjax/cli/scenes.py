@@ -14,6 +14,7 @@ from rich.table import Table
 from pigjax.cli.base import (
     Changes,
     DropInvalid,
+    Images,
     NoCache,
     Origin,
     Out,
@@ -129,7 +130,13 @@ def view(
     frames: Annotated[int, typer.Option(help="Frames of one round.", min=1)] = 48,
     size: Annotated[int, typer.Option(help="Edge of the pictures in pixels.", min=16, max=16384)] = 480,
     elevation: Annotated[float, typer.Option(help="Of the camera, in degrees.", min=-89, max=89)] = 25.0,
-    up: Annotated[str, typer.Option(help="Axis of the world that points up: x, y, z, -x, -y, -z.")] = "z",
+    up: Annotated[
+        str, typer.Option(help="Axis that points up (x, y, z, -x, -y, -z), three numbers with commas, or auto.")
+    ] = "z",
+    views: Annotated[
+        Path | None, typer.Option(help="Posed photos of the scene: start in the first of their cameras.")
+    ] = None,
+    images: Images = None,
     background: Annotated[
         float, typer.Option(help="Grey level behind the scene: 0 black, 1 white.", min=0, max=1)
     ] = 1.0,
@@ -143,23 +150,40 @@ def view(
     from pigjax import io
     from pigjax.cli.turntable import turntable
 
-    cloud = io.load_gaussians(path, drop_invalid=drop_invalid, origin=origin or io.origin_of(path))
+    shift = origin or io.origin_of(path)
+    cloud = io.load_gaussians(path, drop_invalid=drop_invalid, origin=shift)
+    cameras = None if views is None else io.load_cameras(views, images=images, origin=shift)[0]
     io.output_folder(out.parent, files=(out.name,))
     with progress() as bar:
         task = bar.add_task("view", total=frames)
         turntable(
-            cloud, out, frames=frames, size=size, elevation=elevation, up=up, background=background,
+            cloud, out, frames=frames, size=size, elevation=elevation, up=_direction(up), cameras=cameras,
+            background=background,
             progress=lambda done, of: bar.update(task, completed=done, total=of),
         )  # fmt: skip
     console.print(said(f"written to {out}"))
 
 
+def _direction(up: str) -> str | tuple[float, float, float]:
+    """The name of an axis as it is, or three numbers between commas."""
+    parts = up.split(",")
+    if len(parts) != 3:
+        return up
+    try:
+        return (float(parts[0]), float(parts[1]), float(parts[2]))
+    except ValueError:
+        raise InputError(f"--up {up}: give an axis such as -y, three numbers such as 0,0.5,1, or auto.") from None
+
+
 @app.command()
-def info(path: Annotated[Path, typer.Argument(help="A .ply, .splat or .spz, a scene file, or posed photos.")]) -> None:
-    """Say what a file holds."""
+def info(
+    path: Annotated[Path, typer.Argument(help="A .ply, .splat or .spz, a scene file, or posed photos.")],
+    images: Images = None,
+) -> None:
+    """Say what a file holds: sizes, lenses, which way is up, the dense core and what lies outside of it."""
     from pigjax.cli.segmenting import describe_file
 
     table = Table(show_header=False)
-    for name, value in describe_file(path).items():
+    for name, value in describe_file(path, images=images).items():
         table.add_row(*row(name, value))
     console.print(table)

@@ -13,10 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from pigjax import io
+from pigjax.core.camera import Camera
 from pigjax.core.checks import suggest
 from pigjax.core.errors import InputError
+from pigjax.core.extent import Extent, dense_part, scene_extent
 from pigjax.core.gaussians import SH_CONSTANT
 from pigjax.core.harmonics import sh_degree_of
+from pigjax.core.upright import find_up
 from pigjax.io.files import existing
 from pigjax.objects.association import associate_masks
 from pigjax.objects.editing import extract_object, hole_mask, remove_object
@@ -158,8 +161,12 @@ def _sheet(gaussians: Gaussians, views: io.Views, labels: Labels, names: dict[in
     return np.concatenate([sheet, legend])
 
 
-def describe_file(path: Path) -> dict[str, str]:
+def describe_file(path: Path, *, images: Path | None = None) -> dict[str, str]:
     """Contents of a file, in words. Host.
+
+    Args:
+        path: Gaussians, a scene file, or posed photos.
+        images: folder of the photos, where it is not the one that the cameras' file names.
 
     Raises:
         MissingFileError: there is no such file.
@@ -182,13 +189,61 @@ def describe_file(path: Path) -> dict[str, str]:
             "grid spacing": "by the objects' size" if (dx := scene.simulation.dx) is None else f"{dx:g} m",
             "clamp": scene.clamp.mode,
         }
-    cameras, names = io.load_cameras(path)
-    return {
+    return _describe_views(path, images)
+
+
+def _describe_views(path: Path, images: Path | None) -> dict[str, str]:
+    cameras, names = io.load_cameras(path, images=images)
+    about = io.describe_capture(path, images=images)
+    said = {
         "views": f"{len(names)}, {names[0]} to {names[-1]}",
         "size": f"{cameras.width} x {cameras.height} px",
         "focal length": f"{float(cameras.focal[0, 0]):.1f} px",
+        "lens": about.lens,
+        "pixels": f"{about.valid:.1%} of the undistorted pictures count",
         "camera positions": _box(np.asarray(cameras.position)),
     }
+    points = None
+    if about.points is not None and about.points.is_file():
+        points = io.load_points(about.points)[0]
+        extent = scene_extent(points, name=str(about.points))
+        said["sparse points"] = f"{len(points)}, {extent.outliers} of them outside the dense core"
+        said |= _sizes(points, extent)
+    return said | _upright(cameras, points) | _scale()
+
+
+def _upright(cameras: Camera | None, points: np.ndarray | None, extent: Extent | None = None) -> dict[str, str]:
+    """What `world.up = "auto"` and `world.origin = "ground"` would take, and by what."""
+    try:
+        found = find_up(cameras, points, extent=extent)
+    except InputError as error:
+        return {"up": str(error).removeprefix("up: ")}
+    by = f"by the {found.by}"
+    if found.roll is not None:
+        by += f"; pictures roll by {found.roll:.1f} degrees"
+    ground = f"{found.share:.0%} of the core lie on it" if found.share else "no plane: the foot of the core"
+    return {
+        "world.up": f"[{', '.join(f'{value:.4f}' for value in found.up)}]  ({by})",
+        "world.origin": f"[{', '.join(f'{value:.4g}' for value in found.foot)}]  (ground: {ground})",
+    }
+
+
+def _scale() -> dict[str, str]:
+    said = '1 (lengths are taken for metres; objects.NAME.height, as in "0.6 m", gives the true scale)'
+    return {"world.units_per_metre": said}
+
+
+def _sizes(points: np.ndarray, extent: Extent) -> dict[str, str]:
+    """The dense core, and the densest part where the scene is unbounded."""
+    centre, radius = dense_part(points, extent)
+    said = {"dense core": _ball(extent.centre, extent.radius)}
+    if radius < extent.radius:
+        said["densest part"] = _ball(centre, radius) + ", which view frames"
+    return said
+
+
+def _ball(centre: np.ndarray, radius: float) -> str:
+    return f"radius {radius:.3g} around ({', '.join(_numbers(centre, radius))})"
 
 
 def _describe_gaussians(read: tuple[Gaussians, int]) -> dict[str, str]:
@@ -202,7 +257,17 @@ def _describe_gaussians(read: tuple[Gaussians, int]) -> dict[str, str]:
         "size": _size(gaussians),
         "scale": f"median {np.median(scales):.3g} m, largest {scales.max():.3g} m",
         "opacity": f"median {np.median(opacities):.2f}, {np.mean(opacities < 1 / 255):.0%} below 1/255",
-    }
+    } | _situation(gaussians)
+
+
+def _situation(gaussians: Gaussians) -> dict[str, str]:
+    """Core, up and scale of a scene."""
+    if len(gaussians) == 0:
+        return {}
+    extent, means = extent_of(gaussians), np.asarray(gaussians.means)
+    centre, radius = dense_part(means, extent)
+    said = {} if radius == extent.radius else {"densest part": _ball(centre, radius) + ", which view frames"}
+    return said | _upright(None, means, extent) | _scale()
 
 
 def _size(gaussians: Gaussians) -> str:

@@ -298,6 +298,19 @@ def interpolate_path(keys: Camera, frames: int) -> Camera:
     return Camera(world_to_cam, mix(keys.focal), mix(keys.centre), keys.width, keys.height)
 
 
+def focus_of(cameras: Camera) -> Float[np.ndarray, "3"]:
+    """The point nearest to all lines of sight [m], by least squares: what a capture is about. Host.
+
+    Args:
+        cameras: batch of views; where all lines of sight are parallel, the point is among the cameras.
+    """
+    position, forward = np.asarray(cameras.position, float), np.asarray(cameras.world_to_cam, float)[:, 2, :3]
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    middle = position.mean(0)
+    offset = np.einsum("vij,vj->i", across, position - middle)
+    return middle + np.linalg.lstsq(across.sum(0), offset, rcond=1e-6)[0]
+
+
 def _vector(name: str, value: Vector) -> Float[Array, "3"]:
     """Three numbers, finite where they are known."""
     try:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
+from scipy.spatial import cKDTree
 
 from pigjax.core.errors import InputError
 
@@ -15,6 +16,9 @@ _LEAST_WEIGHT = 0.1  # of a point that counts: fainter splats are haze
 _CORE = 0.75  # share of the points whose distance from the middle says how far the scene goes
 _FENCE = 4.0  # times that distance: a ball, a shell, a plane and a rod end below 1.5 times, floaters lie far beyond
 _MOST = 0.95  # share of the core within the radius
+_MOST_WEIGHED = 50_000  # points whose neighbours are looked for
+_NEIGHBOURS = 9  # a point and eight others
+_SHRINKS = 12  # of the ball towards the densest part
 _GRAINS = 3.0  # standard deviations of a splat that are seen: the radius of a scene that is one splat
 
 
@@ -77,6 +81,42 @@ def scene_extent(
     radius = max(reach, _GRAINS * grain) or 1.0
     spread = float(np.linalg.norm(np.std(inside, axis=0))) or radius
     return Extent(centre, radius, spread, inside.min(0), inside.max(0), core)
+
+
+def dense_part(points: Float[np.ndarray, "n 3"], extent: Extent) -> tuple[Float[np.ndarray, "3"], float]:
+    """Middle and radius [m] of what a scene is about: of its dense core, or of the densest part of an unbounded one.
+
+    In a photo capture detail lies where the cameras looked, in a background that goes on for tens of radii. Points of
+    the core are weighed by the inverse distance of their eighth neighbours; the part is the ball around their median
+    with twice the radius that holds half of the weight, found by iteration. A scene that this ball would hold nearly
+    whole is no unbounded one, and the core's middle and radius are returned. Host.
+
+    Args:
+        points: centres [m].
+        extent: of these points, by `scene_extent`.
+    """
+    core = np.asarray(points, np.float64)[extent.core]
+    if len(core) > _MOST_WEIGHED:
+        core = core[np.random.default_rng(0).choice(len(core), _MOST_WEIGHED, replace=False)]
+    neighbours = min(_NEIGHBOURS, len(core))
+    if neighbours < 2:
+        return extent.centre, extent.radius
+    gap = cKDTree(core).query(core, k=neighbours)[0][:, 1:].mean(1)
+    weights = 1 / np.maximum(gap, np.quantile(gap, 0.02) or 1e-12 * extent.radius)
+    near = np.ones(len(core), bool)
+    for _ in range(_SHRINKS):
+        centre = np.array([_weighted_quantile(column, weights[near], 0.5) for column in core[near].T])
+        distance = np.linalg.norm(core - centre, axis=1)
+        half = _weighted_quantile(distance[near], weights[near], 0.5)
+        near = distance <= 2 * half
+    radius = 2 * half
+    return (centre, radius) if 0 < radius < extent.radius else (extent.centre, extent.radius)
+
+
+def _weighted_quantile(values: Float[np.ndarray, "n"], weights: Float[np.ndarray, "n"], share: float) -> float:
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, share * total[-1])])
 
 
 def _grain(scales: Float[np.ndarray, "n"] | None, counted: Bool[np.ndarray, "n"]) -> float:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
 from pigjax.core.extent import Extent, scene_extent
@@ -29,7 +30,7 @@ _FOOT = 0.02  # share of the core's points below its foot, where there is no pla
 
 
 class Upright(NamedTuple):
-    """Up and ground of a scene."""
+    """Up and ground of a scene, as `find_up` gives them."""
 
     up: Float[np.ndarray, "3"]  # unit vector
     foot: Float[np.ndarray, "3"]  # point of the ground below the middle of the dense core
@@ -38,6 +39,7 @@ class Upright(NamedTuple):
     share: float  # of the core's points that lie on the plane of the ground; 0: none was found, and the foot is used
 
 
+@checked
 def find_up(
     cameras: Camera | None, points: Float[np.ndarray, "n 3"] | None, *, extent: Extent | None = None
 ) -> Upright:

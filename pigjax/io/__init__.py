@@ -10,7 +10,7 @@ from pigjax.io.archives import (
     write_csv,
     write_parquet,
 )
-from pigjax.io.cameras import load_cameras, load_views
+from pigjax.io.cameras import describe_capture, load_cameras, load_views
 from pigjax.io.datasets import LAYOUTS, Dataset, id_named, load_dataset, load_names
 from pigjax.io.files import (
     decoding,
@@ -68,6 +68,7 @@ __all__ = [
     "contact_sheet",
     "data_uri",
     "decoding",
+    "describe_capture",
     "digest",
     "digest_of_scene",
     "file_digest",

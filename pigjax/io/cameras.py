@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +29,8 @@ from pigjax.io.lenses import sources, undistorted_ids, undistorted_photo
 from pigjax.io.mask_json import frame_order
 from pigjax.io.masks import load_masks
 from pigjax.io.origin import Origin, shifted_pose
+
+_COARSE_SIZE = 128  # [px] at which the share of valid pixels is told
 
 
 @checked
@@ -150,6 +152,45 @@ def load_cameras(
     shots = read_capture(path, images, origin).shots
     sizes = [_target_size(shot, max_size) for shot in shots]
     return _cameras(shots, sizes, _canvas(shots, sizes), origin), name_views(shots)
+
+
+class CaptureNotes(NamedTuple):
+    """What a capture says of its lenses and points, without its photos."""
+
+    lens: str  # in words
+    valid: float  # share of the undistorted pictures' pixels that the photos have, without masks
+    points: Path | None
+
+
+def describe_capture(path: PathLike, *, images: PathLike | None = None) -> CaptureNotes:
+    """Lenses, valid pixels and points of a capture, for `pigjax info`. Host.
+
+    Args:
+        path: as `load_views` takes it.
+        images: as `load_views` takes it.
+
+    Raises:
+        MissingFileError: as `load_cameras`.
+        InputError: as `load_cameras`.
+    """
+    capture = read_capture(path, images, None)
+    bent = [shot for shot in capture.shots if shot.lens is not None]
+    sizes = [_target_size(shot, _COARSE_SIZE) for shot in capture.shots]
+    width, height = _canvas(capture.shots, sizes)
+    shares = []
+    for shot, size in zip(capture.shots, sizes):
+        inside = 1.0
+        if shot.lens is not None:
+            at = shot.scaled(size)
+            inside = float(sources(shot.lens, at.focal, at.centre, size)[1].mean())
+        shares.append(inside * size[0] * size[1] / (width * height))
+    said = "pinhole"
+    if bent:
+        kinds = sorted({str(shot.lens.kind) for shot in bent if shot.lens is not None})
+        said = (
+            f"{' and '.join(kinds)} with distortion, of {len(bent)} of {len(capture.shots)} photos; undistorted at load"
+        )
+    return CaptureNotes(said, float(np.mean(shares)), capture.points)
 
 
 def load_view_masks(
@@ -394,17 +435,37 @@ def _masks(
     canvas: tuple[int, int],
     **options: Any,
 ) -> Int[np.ndarray, "t h w"]:
-    """Ids of the undistorted pictures' pixels; those of photos are loaded size by size."""
+    """Ids of the undistorted pictures' pixels; -1 all over where a view has no mask and abstains."""
     masks = np.zeros((len(shots), canvas[1], canvas[0]), np.int32)
+    for i, ids in enumerate(_loaded_masks(folder, names, sizes, **options)):
+        if ids.min() < 0:
+            masks[i] = -1
+            continue
+        if (lens := shots[i].lens) is not None:
+            at = shots[i].scaled(sizes[i])
+            ids = undistorted_ids(ids, lens, at.focal, at.centre)
+        masks[i] = _padded(ids, canvas)
+    return masks
+
+
+def _loaded_masks(
+    folder: PathLike, names: Sequence[str], sizes: Sequence[tuple[int, int]], **options: Any
+) -> list[Int[np.ndarray, "h w"]]:
+    """Masks of the photos, size by size; that no view of one size has a mask is no error where others have."""
+    loaded: dict[int, np.ndarray] = {}
+    missing: MissingFileError | None = None
     for size in dict.fromkeys(sizes):
         of_size = [i for i, own in enumerate(sizes) if own == size]
-        loaded = load_masks(folder, [names[i] for i in of_size], size, **options)
-        for i, ids in zip(of_size, loaded):
-            if (lens := shots[i].lens) is not None:
-                at = shots[i].scaled(size)
-                ids = undistorted_ids(ids, lens, at.focal, at.centre)
-            masks[i] = _padded(ids, canvas)
-    return masks
+        try:
+            loaded |= zip(of_size, load_masks(folder, [names[i] for i in of_size], size, **options))
+        except MissingFileError as error:
+            if options.get("missing") != "abstain":
+                raise
+            missing = error
+            loaded |= {i: np.full(size[::-1], -1, np.int32) for i in of_size}
+    if missing is not None and all(ids.min() < 0 for ids in loaded.values()):
+        raise missing
+    return [loaded[i] for i in range(len(names))]
 
 
 def _valid(

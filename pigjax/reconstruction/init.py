@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from pigjax.core.camera import Camera
+from pigjax.core.camera import Camera, focus_of
 from pigjax.core.errors import InputError
 from pigjax.core.extent import scene_extent
 from pigjax.core.gaussians import SH_CONSTANT, Gaussians
@@ -96,11 +96,8 @@ def random_points(
         Positions [m] and colours (0.5).
     """
     rng = np.random.default_rng(seed)
-    position, forward = np.asarray(cameras.position), np.asarray(cameras.world_to_cam)[:, 2, :3]
-    # the point nearest to all optical axes
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    centre = np.linalg.lstsq(across.sum(0), np.einsum("vij,vj->i", across, position), rcond=None)[0]
-    radius = 0.5 * np.linalg.norm(position - centre, axis=1).mean()
+    centre = focus_of(cameras)
+    radius = 0.5 * np.linalg.norm(np.asarray(cameras.position) - centre, axis=1).mean()
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return centre + direction * radius * rng.random((count, 1)) ** (1 / 3), np.full((count, 3), 0.5)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.checks import Limits, shown
 from pigjax.core.errors import InputError, SceneError
@@ -74,8 +75,11 @@ def axis_of(up: str | tuple[float, float, float]) -> Float[np.ndarray, "3"]:
     return np.eye(3)["xyz".index(up[-1])] * (-1 if up.startswith("-") else 1)
 
 
+@checked
 def placed_cameras(cameras: Camera, transform: Float[np.ndarray, "4 4"]) -> Camera:
     """The cameras of a scene that is turned, scaled and shifted as a whole: they draw the same pictures.
+
+    `render(placed(gaussians, matrix), placed_cameras(camera, matrix))`
 
     Args:
         cameras: one, or a batch.
@@ -117,10 +121,7 @@ def file_to_world(
             raise SceneError(f"world.{error}") from None
         axis, foot = found.up if given is None else given, found.foot
     origin = foot if spec.origin == "ground" else np.asarray(spec.origin or (0.0, 0.0, 0.0), np.float64)
-    matrix = np.eye(4) if spec.up is None or axis is None else up_to(axis, _Z)
-    matrix[:3, 3] = -np.dot(matrix[:3, :3], origin)
-    matrix[:3] /= spec.units_per_metre or 1.0
-    return matrix
+    return _matrix(None if spec.up is None else axis, origin, spec.units_per_metre)
 
 
 def _level_camera(up: Float[np.ndarray, "3"]) -> Camera:
@@ -140,12 +141,18 @@ def height_of(gaussians: Gaussians, members: Int[np.ndarray, "m"], up: Float[np.
     return float(high - low)
 
 
-def described(matrix: Float[np.ndarray, "4 4"]) -> dict[str, object]:
-    """The transform in the words of `[world]`, as numbers that give it again."""
+def _matrix(
+    up: Float[np.ndarray, "3"] | None, origin: Float[np.ndarray, "3"], units: float | None
+) -> Float[np.ndarray, "4 4"]:
+    matrix = np.eye(4) if up is None else up_to(up, _Z)
+    matrix[:3, 3] = -np.dot(matrix[:3, :3], origin)
+    matrix[:3] /= units or 1.0
+    return matrix
+
+
+def described(matrix: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
+    """The transform in the words of `[world]`, as numbers that give it again; without `up` where nothing is turned."""
     rotation, scale, shift = similarity(matrix)
     origin = -np.dot(rotation.T, shift) / scale
-    return {
-        "up": [round(float(value), 6) for value in rotation[2]],
-        "units_per_metre": float(f"{1 / scale:.9g}"),
-        "origin": [float(f"{value:.9g}") for value in origin],
-    }
+    turned = {} if np.allclose(rotation, np.eye(3), atol=1e-9) else {"up": tuple(rotation[2].round(9).tolist())}
+    return turned | {"units_per_metre": float(f"{1 / scale:.9g}"), "origin": tuple(origin.round(9).tolist())}

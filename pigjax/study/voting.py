@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.camera import Camera
 from pigjax.core.checks import suggest
@@ -37,6 +37,8 @@ class Voting(eqx.Module):
     temperature: Float[Array, ""] | None  # None: hard votes, which have no gradient
     num_ids: int = eqx.field(static=True)
     config: RenderConfig = eqx.field(static=True)
+    valid: Bool[Array, "t h w"] | None = None  # pixels of `masks` that count; None: all
+    held_valid: Bool[Array, "s h w"] | None = None  # of `held_masks`
 
     def names(self) -> tuple[str, ...]:
         """Every parameter that `with_parameters` takes."""
@@ -70,6 +72,7 @@ class Voting(eqx.Module):
             tau_T=self.tau_T,
             tau_d=self.tau_d,
             temperature=self.temperature,
+            valid=self.valid,
             config=self.config,
         )
         if self.temperature is None:
@@ -81,17 +84,19 @@ class Voting(eqx.Module):
 
         @jax.checkpoint
         def overlap(view):
-            world_to_cam, focal, centre, mask = view
+            world_to_cam, focal, centre, mask, valid = view
             held = self.held_cameras
             camera = Camera(world_to_cam, focal, centre, held.width, held.height)
             frame = render(self.gaussians, camera, outputs=("object_weights",), object_weights=member)
             assert frame.object_weights is not None
             seen = frame.object_weights[..., 1:]
             truth = jax.nn.one_hot(mask, self.num_ids)[..., 1:]
+            if valid is not None:
+                seen, truth = seen * valid[..., None], truth * valid[..., None]
             return jnp.minimum(seen, truth).sum((0, 1)), jnp.maximum(seen, truth).sum((0, 1))
 
         held = self.held_cameras
-        both, either = lax.map(overlap, (held.world_to_cam, held.focal, held.centre, self.held_masks))
+        both, either = lax.map(overlap, (held.world_to_cam, held.focal, held.centre, self.held_masks, self.held_valid))
         iou = jnp.mean(both.sum(0) / jnp.maximum(either.sum(0), 1.0))
         return {"loss": 1 - iou, "iou": iou, "seen": jnp.mean(labels.object_id >= 0)}
 
@@ -122,22 +127,24 @@ def voting(scene: Scene, *, temperature: float | None = None) -> Voting:
     views = eqx.tree_at(lambda v: v.masks, views, masks)
     train, held = views.training, views.held_out
     if held is not None and "train" in views.splits:
-        shown, hidden = (train.cameras, train.masks), (held.cameras, held.masks)
+        shown, hidden = train, held
     else:
         every = np.arange(len(views.cameras)) % 4 == 3
-        shown, hidden = ((views.cameras[pick], masks[pick]) for pick in (~every, every))
-    config = RenderConfig() if temperature is None else enough_capacity(inputs.gaussians, shown[0], RenderConfig())
+        shown, hidden = views[np.flatnonzero(~every)], views[np.flatnonzero(every)]
+    config = RenderConfig() if temperature is None else enough_capacity(inputs.gaussians, shown.cameras, RenderConfig())
     return Voting(
         gaussians=inputs.gaussians,
-        cameras=shown[0],
-        masks=jnp.asarray(shown[1]),
-        held_cameras=hidden[0],
-        held_masks=jnp.asarray(hidden[1]),
+        cameras=shown.cameras,
+        masks=jnp.asarray(shown.masks),
+        held_cameras=hidden.cameras,
+        held_masks=jnp.asarray(hidden.masks),
         tau_T=jnp.asarray(scene.segmentation.tau_T),
         tau_d=jnp.asarray(scene.segmentation.tau_d),
         temperature=None if temperature is None else jnp.asarray(temperature),
         num_ids=number,
         config=config,
+        valid=None if shown.valid is None else jnp.asarray(shown.valid),
+        held_valid=None if hidden.valid is None else jnp.asarray(hidden.valid),
     )
 
 
