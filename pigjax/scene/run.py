@@ -33,7 +33,7 @@ from pigjax.segmentation import Labels, pixel_ids
 from pigjax.splat import Gaussians, render
 
 _SHEET_FRAMES = 12
-_FILES = ("video.mp4", "contact_sheet.png", "objects.png", "labels.npz", "report.json")
+_FILES = ("video.mp4", "contact_sheet.png", "objects.png", "labels.npz", "report.json", "scene.json")
 Progress = Callable[[str, int, int], None]  # stage, done, of
 
 
@@ -44,7 +44,8 @@ def run_scene(
     """Simulate a scene and draw its video. Host.
 
     Into `out_dir` go `video.mp4`, `contact_sheet.png`, `objects.png` (the objects in their colours), `labels.npz`,
-    `states/<frame>.npz` (x, v and F_visual of every particle) and `report.json`. A run that was killed goes on from its
+    `states/<frame>.npz` (x, v and F_visual of every particle), `report.json` and `scene.json` (the scene and the
+    folder of its files, for `pigjax view`). A run that was killed goes on from its
     last state; when all states are there, only the video is redrawn.
 
     Args:
@@ -85,6 +86,7 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: 
         parts = provenance(scene, inputs)
         results = (io.STATES, "last.ckpt")
         key = io.claim(out / "states", parts, results=results, overwrite=overwrite, signed=io.signed)
+        io.write_json(out / "scene.json", {"folder": Path(scene.folder).resolve(), "scene": scene})
     with report.stage("segment"):
         tell("segment", 0, 1)
         labels = segment(scene, inputs)

@@ -1,0 +1,219 @@
+"""What `pigjax view` opens: a file of splats, labelled splats, a scene file, or the folder of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from pigjax import io
+from pigjax.core.checks import shown
+from pigjax.core.errors import InputError, SceneError
+from pigjax.scene import Scene, scene_from
+from pigjax.scene.plan import Inputs, read_inputs, segment
+from pigjax.scene.schema import read_file
+from pigjax.segmentation import Labels
+from pigjax.splat import Gaussians
+from pigjax.splatting.types import extent_of
+
+SPLATS = (".ply", ".splat", ".spz")
+_CELLS = 24  # of the scene's radius, where nothing says how fine its simulation is to be
+_FRAMES = 96
+
+
+@dataclass
+class Opened:
+    """Splats, their objects, and the scene file that is or could be theirs."""
+
+    title: str
+    folder: Path  # the only place where the page writes
+    gaussians: Gaussians
+    object_id: Int[np.ndarray, "n"]  # 0 background, -1 never seen
+    names: dict[int, str]  # of ids
+    values: dict[str, Any]  # of the scene file
+    base: Path  # of the paths in these values
+    states: Path | None = None  # folder of the states of a run
+    accuracy: str | None = None
+    labels: Labels | None = None
+    notes: list[str] = field(default_factory=list)
+
+    def inputs(self, scene: Scene) -> Inputs:
+        """What `make_plan` needs, for the objects of a scene."""
+        named = {name: number for number, name in self.names.items()}
+        ids = {name: named.get(name, -1) if spec.id is None else spec.id for name, spec in scene.objects.items()}
+        return Inputs(self.gaussians, None, ids, self.names)
+
+    def all_labels(self) -> Labels:
+        """Labels as they were lifted, or one that says no more than `object_id`."""
+        if self.labels is not None:
+            return self.labels
+        return _plain_labels(self.object_id)
+
+
+def open_path(
+    path: Path,
+    *,
+    accuracy: str | None = None,
+    drop_invalid: bool = False,
+    origin: Any = None,
+    up: str | None = None,
+    tell: Callable[[str], None] = lambda stage: None,
+) -> Opened:
+    """Read what is to be shown. Host.
+
+    Args:
+        path: a `.ply`, `.splat` or `.spz`, a scene file, or the folder of a run, of `pigjax segment` or of a scene.
+        accuracy: level of the scene instead of its file's.
+        drop_invalid: leave out Gaussians with NaN or infinity.
+        origin: subtracted from the positions of a file of splats [m]; None: as the file says.
+        up: axis of the world that points up, for files that do not say: "z".
+        tell: called with each stage that takes a while.
+
+    Raises:
+        MissingFileError: there is nothing at `path`.
+        InputError: nothing there can be shown, or a file is damaged.
+    """
+    if path.suffix.lower() in SPLATS:
+        return _open_splats(path, drop_invalid, origin, up or "z")
+    if path.suffix == ".toml":
+        return _open_scene(read_file(path, "scene file"), path.parent, path.name, accuracy, tell)
+    if (path / "scene.json").is_file() and (path / "states").is_dir():
+        return _open_run(path, tell)
+    if (path / "labels.npz").is_file() and (path / "objects").is_dir():
+        return _open_segments(path, drop_invalid, up or "z")
+    if (path / "scene.toml").is_file():
+        return _open_scene(read_file(path / "scene.toml", "scene file"), path, "scene.toml", accuracy, tell)
+    known = f"a {', '.join(SPLATS)}, a scene file (.toml), or the folder of a run, of 'pigjax segment' or of a scene"
+    io.output_folder(path) if path.is_dir() else io.read_gaussians(path)  # says what is wrong with the path itself
+    raise InputError(f"{path}: nothing to show in it; give {known}.")
+
+
+def _open_splats(path: Path, drop_invalid: bool, origin: Any, up: str) -> Opened:
+    origin = origin or io.origin_of(path)
+    gaussians = io.load_gaussians(path, drop_invalid=drop_invalid, origin=origin)
+    ids, names, notes = np.ones(len(gaussians), np.int32), {1: io.safe_name(path.stem)}, []
+    stored = path.parent / "labels.npz"
+    if stored.is_file():
+        try:
+            ids = io.load_labels(stored, len(gaussians), scene=io.digest_of_scene(gaussians)).object_id
+            names = {}
+        except InputError as error:
+            notes.append(f"labels.npz beside it is not its own: {error}")
+    values = new_values(gaussians, path.name, names, up)
+    if any(origin):
+        values["input"]["origin"] = [float(value) for value in origin]
+    if drop_invalid:
+        values["input"]["drop_invalid"] = True
+    return Opened(path.name, path.parent, gaussians, ids, names, values, path.parent, notes=notes)
+
+
+def _open_scene(
+    values: dict[str, Any], folder: Path, title: str, accuracy: str | None, tell: Callable[[str], None]
+) -> Opened:
+    scene = scene_from(values, folder=folder, where=title, accuracy=accuracy)
+    tell("read")
+    inputs = read_inputs(scene)
+    tell("segment")
+    labels = segment(scene, inputs)
+    names = {**inputs.names, **{number: name for name, number in inputs.ids.items()}}
+    object_id = np.asarray(labels.object_id)
+    return Opened(title, folder, inputs.gaussians, object_id, names, values, folder, accuracy=accuracy, labels=labels)
+
+
+def _open_run(path: Path, tell: Callable[[str], None]) -> Opened:
+    told = io.read_json(path / "scene.json")
+    try:
+        # its numbers are those of its level of accuracy, which is not to be applied twice
+        values = _given({**told["scene"], "accuracy": "standard"})
+        values.pop("folder", None)
+        scene = scene_from(values, folder=told["folder"], where=str(path / "scene.json"))
+    except (TypeError, KeyError, AttributeError):
+        raise SceneError(f"{path / 'scene.json'}: is not what 'pigjax run' writes; run the scene again.") from None
+    tell("read")
+    spec = scene.input
+    gaussians = io.load_gaussians(scene.path(spec.gaussians), drop_invalid=spec.drop_invalid, origin=spec.origin)
+    names = {} if spec.names is None else io.load_names(scene.path(spec.names))
+    if (path / "labels.npz").is_file():
+        stored = io.load_labels(path / "labels.npz", len(gaussians))
+        columns = None if stored.ids is None else jnp.asarray(stored.ids)
+        labels = Labels(
+            jnp.asarray(stored.object_id), jnp.asarray(stored.votes), jnp.asarray(stored.confidence), ids=columns
+        )
+    else:  # a run that has just begun
+        tell("segment")
+        labels = segment(scene, read_inputs(scene))
+    opened = Opened(
+        path.name, path, gaussians, np.asarray(labels.object_id), names, values, Path(told["folder"]),
+        states=path / "states", accuracy="standard", labels=labels,
+    )  # fmt: skip
+    ids = opened.inputs(scene).ids
+    opened.names = {**names, **{number: name for name, number in ids.items() if number >= 0}}
+    return opened
+
+
+def _given(values: Any) -> Any:
+    """Tables without the fields that are None, which TOML cannot say."""
+    if isinstance(values, dict):
+        return {key: _given(value) for key, value in values.items() if value is not None}
+    return values
+
+
+def _open_segments(path: Path, drop_invalid: bool, up: str) -> Opened:
+    """The objects of `pigjax segment`, joined again."""
+    clouds, ids, names = [], [], {}
+    for file in sorted((path / "objects").glob("*.ply")):
+        number, _, name = file.stem.partition("_")
+        if not (number.isdecimal() or number == "unseen"):
+            continue
+        clouds.append(io.load_gaussians(file, drop_invalid=drop_invalid, origin=io.origin_of(file)))
+        ids.append(np.full(len(clouds[-1]), -1 if number == "unseen" else int(number), np.int32))
+        if name:
+            names[int(number)] = name
+    if not clouds:
+        raise InputError(f"{path / 'objects'}: no object in it; run 'pigjax segment' again.")
+    widest = max(cloud.sh.shape[1] for cloud in clouds)
+    gaussians = jax.tree.map(lambda *parts: jnp.concatenate(parts), *(_widened(cloud, widest) for cloud in clouds))
+    values = new_values(gaussians, "gaussians.ply", names, up)
+    note = "a scene file needs the photos and masks that these objects came from: add input.views"
+    return Opened(path.name, path, gaussians, np.concatenate(ids), names, values, path, notes=[note])
+
+
+def _widened(gaussians: Gaussians, bands: int) -> Gaussians:
+    short = bands - gaussians.sh.shape[1]
+    sh = jnp.pad(gaussians.sh, ((0, 0), (0, short), (0, 0)))
+    return Gaussians(gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.logit_opacities, sh)
+
+
+def _plain_labels(object_id: Any) -> Labels:
+    object_id = np.asarray(object_id, np.int32)
+    ids = np.unique(np.maximum(object_id, 0))
+    votes = (object_id[:, None] == ids).astype(np.int32)
+    return Labels(jnp.asarray(object_id), jnp.asarray(votes), jnp.ones(len(object_id)), ids=jnp.asarray(ids))
+
+
+def new_values(gaussians: Gaussians, file: str, names: dict[int, str], up: str) -> dict[str, Any]:
+    """Values of a new scene file: cells of a 24th of the scene's radius, all objects of jelly."""
+    dx = float(f"{extent_of(gaussians).radius / _CELLS:.2g}")
+    return {
+        "input": {"gaussians": file, "up": up},
+        "simulation": {"dx": dx, "frames": _FRAMES},
+        "objects": {name: {"id": number, "material": "jelly"} for number, name in names.items() if number > 0},
+    }
+
+
+def up_of(values: dict[str, Any]) -> str:
+    """Name of the axis that points up.
+
+    Raises:
+        SceneError: the file has none of the known ones.
+    """
+    up = values.get("input", {}).get("up", "z")
+    if not isinstance(up, str) or up.removeprefix("-") not in ("x", "y", "z"):
+        raise SceneError(f"input.up = {shown(up)}: choose one of x, y, z, -x, -y, -z.")
+    return up
