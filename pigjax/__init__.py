@@ -9,6 +9,7 @@ from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.core.camera import Camera, interpolate_path, look_at, orbit, stack_cameras
 from pigjax.core.errors import InputError, MissingFileError, SceneError, SimulationError
 from pigjax.core.metrics import boundary_iou, mean_iou, psnr, ssim
+from pigjax.core.regions import BoxRegion, HalfSpace, SphereRegion
 from pigjax.coupling.binding import at_frame, bind, deform
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
@@ -28,6 +29,7 @@ from pigjax.mls_mpm import SimConfig, rollout, step
 from pigjax.mpm import Grid, Health, Particles, Trajectory, fit_grid, make_particles, vast_grid
 from pigjax.mpm.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
 from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.forces import Force, ForceField, Impulse, Spring, Wind, grab
 from pigjax.mpm.materials import Material, MaterialTable, material_table, preset
 from pigjax.mpm.sleep import Sleep
 from pigjax.mpm.timestep import choose_integrator, choose_substeps, stable_dt
@@ -58,16 +60,21 @@ __all__ = [
     "BodyContact",
     "Bounds",
     "Box",
+    "BoxRegion",
     "Camera",
     "Capsule",
     "ClampParams",
     "Cylinder",
     "Experiment",
     "FitConfig",
+    "Force",
+    "ForceField",
     "Frame",
     "Gaussians",
     "Grid",
+    "HalfSpace",
     "Health",
+    "Impulse",
     "InputError",
     "Labels",
     "Material",
@@ -84,10 +91,13 @@ __all__ = [
     "SimulationError",
     "Sleep",
     "Sphere",
+    "SphereRegion",
     "Splats",
+    "Spring",
     "Table",
     "Trajectory",
     "Views",
+    "Wind",
     "associate_masks",
     "at_frame",
     "bind",
@@ -105,6 +115,7 @@ __all__ = [
     "fill_unseen",
     "fit",
     "fit_grid",
+    "grab",
     "hole_mask",
     "interpolate_path",
     "lift_masks",

@@ -9,10 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pigjax.core.regions import HalfSpace
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, group_by_law, make_particles
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.forces import ForceField, Spring, Wind
 from pigjax.mpm.materials import LAWS, Material, Parameters, material_table, respond
 
 DX = 1 / 8
@@ -39,7 +41,7 @@ def material(law, **numbers):
     return Material(law, **{**ELASTIC, **own, **numbers})
 
 
-def traced(materials=None, *, colliders=(), contact=None, **config):
+def traced(materials=None, *, colliders=(), contact=None, pins=(), forces=(), **config):
     """One step of two particles of the first material."""
     table = material_table(materials or [material("neo_hookean")])
     particles = make_particles(jnp.full((2, 3), 0.6), volume=1e-4, table=table)
@@ -48,7 +50,7 @@ def traced(materials=None, *, colliders=(), contact=None, **config):
         settings = SimConfig(substeps=1, devices=1, **config)
         return rollout(
             particles, DOMAIN, table, settings, frames=1, frame_dt=1e-3, gravity=(0.0, 0.0, -9.8), colliders=colliders,
-            contact=contact,
+            contact=contact, pins=pins, forces=forces,
         )  # fmt: skip
 
     return jax.make_jaxpr(run)(particles, table)
@@ -89,6 +91,7 @@ def plain():
 def test_tracing_is_deterministic_and_this_test_sees_a_difference(plain):
     assert text(traced()) == text(plain)
     assert text(traced(walls="slip")) != text(plain)
+    assert text(traced(pins=(HalfSpace((0.0, 0.0, 0.4), (0.0, 0.0, 1.0)),))) != text(plain)
 
 
 @pytest.mark.parametrize(
@@ -96,6 +99,8 @@ def test_tracing_is_deterministic_and_this_test_sees_a_difference(plain):
     [
         {"colliders": ()},
         {"contact": None},
+        {"pins": ()},
+        {"forces": ()},
         {"kernel": "quadratic"},
         {"integrator": "explicit"},
         {"differentiation": "reverse"},
@@ -135,6 +140,7 @@ SIGNS = {
     "drucker_prager": (lambda: traced([material("drucker_prager")]), lambda p: primitives(p)["tan"] > 0),
     "von_mises": (lambda: traced([material("von_mises")]), lambda p: primitives(p)["exp"] > 0),
     "foam": (lambda: traced([material("foam")]), lambda p: primitives(p)["pow"] > 0),
+    "gusts": (lambda: traced(forces=(Wind((1.0, 0, 0), 1.0, gusts=1.0),)), lambda p: primitives(p)["cos"] > 0),
 }
 
 
@@ -165,6 +171,19 @@ def test_colliders_at_rest_are_found_once_and_moving_ones_in_each_step(plain):
     assert nodes[0] == nodes[1] < nodes[2]
     assert primitives(turning)["cos"] > 0
     assert primitives(moving)["cos"] == primitives(plain)["cos"] == 0
+
+
+def test_a_force_traces_what_it_has():
+    """A region, a span, weights and gusts each cost their own equations, and nothing where they are not given."""
+    field, wind = ((0.0, 0.0, 1.0),), ((1.0, 0.0, 0.0), 1.0)
+    ball = HalfSpace((0.0, 0.0, 0.4), (0.0, 0.0, 1.0))
+    base = in_steps(traced(forces=(ForceField(*field),))).total()
+    for more in ({"region": ball}, {"start": 0.1}, {"weights": jnp.ones(2)}, {"gradient": jnp.eye(3)}):
+        assert in_steps(traced(forces=(ForceField(*field, **more),))).total() > base, more
+    steady, gusty = (primitives(traced(forces=(Wind(*wind, gusts=gusts),))) for gusts in (None, 1.0))
+    assert steady["cos"] == 0 < gusty["cos"]
+    sums = [in_steps(traced(forces=forces))["reduce_sum"] for forces in ((), (Spring((0.0, 0, 0), 1.0),))]
+    assert sums[1] == sums[0] + 4  # of weight, place, velocity and squared weight per mass
 
 
 def test_matter_carries_only_the_state_that_its_law_has():

@@ -92,13 +92,13 @@ def run(module: ModuleType, options: argparse.Namespace, command: str, changed: 
     for name in options.parts or module.PARTS:
         title, study = module.PARTS[name]
         print(f"\n## {title}\n")
-        begun, worked = time.perf_counter(), time.process_time()
+        worked = time.process_time()
         with kept() as text:
             print(f"`{command} {name}{changed}`, {machine()}\n")
             if said := study(options):
                 print(said)
-            took, worked = time.perf_counter() - begun, time.process_time() - worked
-            print(f"\n{took:.0f} s, {worked:.0f} s of processor time, at most {peak_memory():.1f} GB.")
+            worked = time.process_time() - worked  # hardly depends on other jobs
+            print(f"\n{worked:.0f} s of processor time, at most {peak_memory():.1f} GB.")
         if options.write:
             write_section(options.write, heading.rstrip("."), title, text.getvalue())
 

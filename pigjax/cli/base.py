@@ -24,6 +24,7 @@ from rich.progress import (
 from rich.text import Text
 
 from pigjax.core.errors import InputError
+from pigjax.io.compile_cache import SWITCH, use_compile_cache
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -85,6 +86,16 @@ def _hush(quiet: bool) -> bool:
     return quiet
 
 
+def _without_cache(no_cache: bool) -> bool:
+    if no_cache:
+        os.environ[SWITCH] = "off"
+    return no_cache
+
+
+NoCache = Annotated[
+    bool,
+    typer.Option("--no-cache", help="Compile everything anew and keep nothing of it.", callback=_without_cache),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors alone.", callback=_hush)]
 
 
@@ -103,6 +114,12 @@ def said(text: object, *, label: str = "", style: str = "") -> Text:
 def row(*cells: object) -> tuple[Text, ...]:
     """Cells of a table, printed literally."""
     return tuple(said(cell) for cell in cells)
+
+
+def prepare_jax() -> None:
+    """Use all cores, and keep compiled programs for the next command."""
+    one_device_per_core()
+    use_compile_cache()
 
 
 def one_device_per_core() -> None:

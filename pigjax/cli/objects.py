@@ -12,14 +12,15 @@ from rich.table import Table
 
 from pigjax.cli.base import (
     DropInvalid,
+    NoCache,
     Origin,
     Out,
     Overwrite,
     Quiet,
     app,
     console,
-    one_device_per_core,
     output_path,
+    prepare_jax,
     progress,
     row,
     said,
@@ -65,9 +66,10 @@ def reconstruct(
     origin: Origin = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Fit Gaussians to photos; writes OUT/gaussians.ply, and goes on from OUT/checkpoint if it was stopped."""
-    one_device_per_core()
+    prepare_jax()
     import jax
 
     from pigjax import io
@@ -77,7 +79,9 @@ def reconstruct(
 
     needs_masks = only is not None or random_background
     doublings = max(math.ceil(math.log2(splats / start_splats)), 1) if start_splats else 1
-    loaded = io.load_views(views, masks=needs_masks, max_size=max_size, background=background, origin=origin)
+    loaded = io.load_views(
+        views, masks=needs_masks, missing_masks="abstain", max_size=max_size, background=background, origin=origin
+    )
     points = io.load_points(loaded.points_path, origin=origin) if loaded.points_path else None
     config = FitConfig(
         steps=steps,
@@ -162,6 +166,7 @@ def segment(
     origin: Origin = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Lift masks to the Gaussians; writes labels, one .ply per object, and a sheet that shows which id is which.
 
@@ -171,7 +176,7 @@ def segment(
     from pigjax.cli.segmenting import segment_files
 
     cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid, origin=origin)
-    loaded = io.load_views(views, masks=masks if masks is not None else True, origin=origin)
+    loaded = io.load_views(views, masks=masks if masks is not None else True, missing_masks="abstain", origin=origin)
     known = {} if names is None else io.load_names(names)
     settings = _settings(tau_t, tau_d, weighting, purity, min_seen)
     counts = segment_files(
@@ -206,6 +211,7 @@ def evaluate(
     origin: Origin = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Score objects against true masks (mIoU, mBIoU); writes OUT/scores.json and OUT/sheet.png."""
     from pigjax import io

@@ -15,6 +15,7 @@ from rich.table import Table
 from pigjax.cli.base import (
     Changes,
     DropInvalid,
+    NoCache,
     Origin,
     Out,
     Overwrite,
@@ -22,8 +23,8 @@ from pigjax.cli.base import (
     Stopped,
     app,
     console,
-    one_device_per_core,
     output_path,
+    prepare_jax,
     progress,
     row,
     said,
@@ -58,6 +59,7 @@ def demo(
     changes: Changes = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Simulate the bundled tabletop scene and leave a video."""
     _run(example_folder() / "scene.toml", out, accuracy, changes, overwrite=overwrite)
@@ -72,6 +74,7 @@ def run(
     drop_invalid: DropInvalid = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Simulate a scene and draw its video; a killed run goes on from its last frame."""
     _run(scene, out, accuracy, changes, drop_invalid=drop_invalid, overwrite=overwrite)
@@ -86,7 +89,7 @@ def _run(
     drop_invalid: bool = False,
     overwrite: bool = False,
 ) -> None:
-    one_device_per_core()
+    prepare_jax()
     from pigjax.scene import load_scene, run_scene
     from pigjax.scene.decode import settings_from
 
@@ -137,9 +140,10 @@ def view(
     drop_invalid: DropInvalid = False,
     origin: Origin = None,
     quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Open a page to look at splats, a scene or a run, and to simulate it live; with -o draw a file from all around."""
-    one_device_per_core()
+    prepare_jax()
     if out is None:
         _open_page(path, host, port, browser, splats, accuracy, up, drop_invalid, origin)
         return

@@ -85,7 +85,7 @@ def segment_files(
     results = ("labels.npz", "coloured.ply", "objects.png", "objects", "removed")
     io.claim(out, parts, results=results, overwrite=overwrite)
     io.output_folder(out / "objects")
-    train = views.training
+    train = views.voters
     assert train.masks is not None
     labels = lift(gaussians, train.cameras, train.masks, fill=fill, **settings)
     object_id = np.asarray(labels.object_id)

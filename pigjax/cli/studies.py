@@ -10,7 +10,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from pigjax.cli.base import Changes, Out, Overwrite, Quiet, app, console, one_device_per_core, progress, row, said
+from pigjax.cli.base import Changes, NoCache, Out, Overwrite, Quiet, app, console, prepare_jax, progress, row, said
 
 
 @app.command()
@@ -23,9 +23,10 @@ def sweep(
     overwrite: Overwrite = False,
     changes: Changes = None,
     quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Score every set of parameters of a study: OUT/table.csv, a plot, and the best as a scene; goes on if stopped."""
-    one_device_per_core()
+    prepare_jax()
     if coordinator is not None:
         _join(coordinator, processes, process)
     from pigjax.scene.decode import settings_from
@@ -66,9 +67,10 @@ def tune(
     overwrite: Overwrite = False,
     changes: Changes = None,
     quiet: Quiet = False,
+    no_cache: NoCache = False,
 ) -> None:
     """Find the parameters of least loss: OUT/history.png, and the best as a scene OUT/best.toml; goes on if stopped."""
-    one_device_per_core()
+    prepare_jax()
     from pigjax.scene.decode import settings_from
     from pigjax.study import load_study, tune_study
 

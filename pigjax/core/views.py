@@ -22,7 +22,7 @@ class Views(eqx.Module):
     cameras: Camera  # batch of t
     names: tuple[str, ...] = eqx.field(static=True)  # file names without suffix; with it or folders if they repeat
     images: Float[np.ndarray | Array, "t h w 3"]  # RGB in 0..1
-    masks: Int[np.ndarray | Array, "t h w"] | None  # object ids
+    masks: Int[np.ndarray | Array, "t h w"] | None  # object ids; -1 all over in views without a mask, which do not vote
     splits: tuple[str, ...] = eqx.field(static=True)  # "train", "test", ...
     points_path: Path | None = eqx.field(static=True, default=None)  # sparse cloud for `load_points`
 
@@ -53,6 +53,30 @@ class Views(eqx.Module):
     def training(self) -> Views:
         """Views of the split "train"; all views where there is none."""
         return self.subset("train") if "train" in self.splits else self
+
+    @property
+    def masked(self) -> Views:
+        """Views that have a mask; the others do not vote, nor is an object fitted to them.
+
+        Raises:
+            InputError: no view has one.
+        """
+        has_mask = np.zeros(len(self), bool) if self.masks is None else np.asarray(self.masks)[:, 0, 0] >= 0
+        if not has_mask.any():
+            raise InputError(
+                f"Views: none of {len(self)} views has a mask; load them with load_views(..., masks=True)."
+            )
+        return self if has_mask.all() else self[np.flatnonzero(has_mask)]
+
+    @property
+    def voters(self) -> Views:
+        """Training views with a mask; where no training view has one, all views with a mask.
+
+        Raises:
+            InputError: no view has one.
+        """
+        masked = self.masked
+        return masked.training if "train" in masked.splits else masked
 
     @property
     def held_out(self) -> Views | None:

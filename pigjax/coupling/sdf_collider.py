@@ -35,7 +35,8 @@ def collider_from_gaussians(
     """Collider from the surface of still Gaussians. Host.
 
     The surface may be open: all points behind it are inside, however deep, so a floor or a table seen from above bears
-    loads. Where another object hid it from the cameras, the surface is continued as flat as its rim.
+    loads. Where another object hid it from the cameras, the surface is continued as flat as its rim. Distances are
+    moving averages over an oriented point cloud (Alexa & Adamson 2004).
 
     Args:
         gaussians: of the object.

@@ -45,7 +45,8 @@ def seed_particles(
     Every Gaussian of such an object becomes a particle at its centre, unless it is a floater. The inside is filled by
     a jittered lattice, one particle in each lattice cell that holds no Gaussian. The volume of the solid in a cell
     is shared by the Gaussians in it, each at least 5 % of a cell, and scaled so that the object has the volume of its
-    solid. Where one object lies in another, the larger one is not filled there.
+    solid. Where one object lies in another, the larger one is not filled there. PhysGaussian (Xie et al. 2024) fills
+    Gaussians too; here the inside is decided by winding numbers (Barill et al. 2018).
 
     Args:
         gaussians: the scene.

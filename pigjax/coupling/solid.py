@@ -92,9 +92,30 @@ def shell_of(gaussians: Gaussians, *, name: str = "gaussians") -> Shell:
 
 
 def _connected(means: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"]) -> tuple[Bool[np.ndarray, "n"], float]:
+    component, spacing = parts_of(means, radii)
+    sizes = np.bincount(component)
+    return large_parts(sizes, len(means))[component], spacing
+
+
+def large_parts(sizes: Int[np.ndarray, "c"], count: int) -> Bool[np.ndarray, "c"]:
+    """Which parts hold 1 % of `count` Gaussians or more; the largest always does."""
+    large = sizes >= max(2, 0.01 * count)
+    large[np.argmax(sizes)] = True
+    return large
+
+
+def parts_of(means: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "n"], float]:
+    """Number of the connected part that each Gaussian belongs to, and the typical distance between neighbours [m].
+
+    Neighbours are linked where their gap is at most four times the typical one, or twice their standard deviations.
+
+    Args:
+        means: centres, finite [m].
+        radii: largest standard deviations [m].
+    """
     count = len(means)
     if count == 1:
-        return np.ones(1, bool), float(radii[0])
+        return np.zeros(1, int), float(radii[0])
     distances, neighbours = cKDTree(means).query(means, k=min(7, count))
     # where most centres coincide, the radii of the splats are the scale
     typical = float(np.median(distances[:, -1])) or float(np.median(radii))
@@ -103,11 +124,8 @@ def _connected(means: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"]) -
     rows = np.repeat(np.arange(count), neighbours.shape[1])[linked.ravel()]
     graph = coo_array((np.ones(len(rows), bool), (rows, neighbours[linked])), (count, count))
     _, component = connected_components(graph, directed=False)
-    sizes = np.bincount(component)
-    large = sizes >= max(2, 0.01 * count)
-    large[np.argmax(sizes)] = True
     # the 6th of randomly scattered neighbours on a surface of n points per m² is 1.38/√n away
-    return large[component], max(0.72 * typical, 1e-12 * float(np.abs(means).max()))
+    return component, max(0.72 * typical, 1e-12 * float(np.abs(means).max()))
 
 
 def solid_of(shell: Shell, *, max_cells: int = 64) -> Solid:

@@ -55,7 +55,8 @@ def load_views(
         images: folder of the photos, where they are not where the file says (for COLMAP and INRIA: `images`).
         masks: folder or JSON of instance masks (see `load_masks`); True means `object_mask` beside the photos' folder.
         merge: mask ids to replace, {3: 2} turns 3 into 2.
-        missing_masks: "error", or "empty": a view without a mask gets background everywhere.
+        missing_masks: "error"; "empty": a view without a mask gets background everywhere; or "abstain": it gets -1 and
+            does not vote (`Views.masked`).
         holes: background of up to this many pixels that one object encloses becomes that object.
         split: load only the views of this split.
         only: load only the views of these names, or of this one.

@@ -52,7 +52,8 @@ def load_masks(
         names: names of the views.
         size: width and height of the views [px].
         merge: ids to replace, all at once: {3: 2} turns 3 into 2.
-        missing: "error", or "empty": a view without a mask gets background everywhere.
+        missing: "error"; "empty": a view without a mask gets background everywhere; or "abstain": it gets -1, and a
+            warning tells how many do.
         holes: background enclosed by one object alone becomes that object, where it has at most this many pixels of
             the mask as stored.
         id_field: field of a JSON annotation that is the object's id, such as "category_id".
@@ -60,12 +61,12 @@ def load_masks(
             not given.
 
     Raises:
-        MissingFileError: the folder, or the mask of a view, does not exist.
+        MissingFileError: the folder, or the mask of a view (of all views, where they may abstain), does not exist.
         InputError: a mask is damaged, has another aspect ratio than the view or is far larger, or holds no ids; ids
             outside 0..2³¹ - 1; names that repeat; or a view with a .png and a .npy.
     """
-    if missing not in ("error", "empty"):
-        raise InputError(f"missing = {missing!r}: choose 'error' or 'empty'.")
+    if missing not in ("error", "empty", "abstain"):
+        raise InputError(f"missing = {missing!r}: choose 'error', 'empty' or 'abstain'.")
     if holes < 0:
         raise InputError(f"holes = {holes}: give the most pixels that a hole may have, or 0.")
     twice = [name for name, count in Counter(names).items() if count > 1]
@@ -76,7 +77,7 @@ def load_masks(
     find = _finder(folder, names, frame_order(names) if frames is None else frames, id_field)
     width, height = size
     masks = np.zeros((len(names), height, width), np.int32)
-    resized = []
+    resized, without = [], []
     for mask, name in zip(masks, names):
         found = find(name)
         if found is not None:
@@ -86,10 +87,14 @@ def load_masks(
                 resized += [where] if ids.shape != mask.shape else []
                 mask[:] = _nearest(_filled(ids, holes), size)
         elif missing == "error":
-            raise MissingFileError(
-                f"{folder}: no mask for view '{name}' ({name}.png or {name}.npy) nor in JSON; add it,"
-                " or let it be 'empty'."
-            )
+            raise _missing(folder, name)
+        else:
+            without.append(name)
+            mask[:] = -1 if missing == "abstain" else 0
+    if missing == "abstain" and without:
+        if len(without) == len(names):
+            raise _missing(folder, without[0])
+        warnings.warn(f"{folder}: {len(without)} of {len(names)} views have no mask; they do not vote.", stacklevel=2)
     if resized:
         warnings.warn(
             f"{resized[0]}: resized to {width}x{height} by nearest pixel, as {len(resized)} of {len(names)} masks.",
@@ -117,6 +122,12 @@ def save_masks(folder: PathLike, names: Sequence[str], masks: Integer[np.ndarray
     for name, mask in zip(names, masks, strict=True):
         with writing(Path(folder) / f"{name}.png") as partial:
             Image.fromarray(mask.astype(np.uint8 if high < 256 else np.uint16)).save(partial)
+
+
+def _missing(folder: PathLike, name: str) -> MissingFileError:
+    return MissingFileError(
+        f"{folder}: no mask for view '{name}' ({name}.png or {name}.npy) nor in JSON; add it, or let it be 'empty'."
+    )
 
 
 def _finder(

@@ -24,7 +24,7 @@ from jaxtyping import Array, Int
 class Steps(NamedTuple):
     """The static part of steps in a row."""
 
-    begin: Callable  # (shared, state): the value between the halves of a step
+    begin: Callable  # (shared, state, number of the step): the value between the halves of a step
     end: Callable  # (shared, state, between, number of the step): state after the step, and its health
     perfect: Callable  # (): the health of no step, which has a method `combine`
     length: int
@@ -58,7 +58,8 @@ def run_steps(steps: Steps, shared: Any, state: Any, first: Int[Array, ""]) -> t
 
     def visit(i, carry):
         state, health = carry
-        state, own = steps.end(shared, state, steps.begin(shared, state), first + i)
+        number = first + i
+        state, own = steps.end(shared, state, steps.begin(shared, state, number), number)
         return state, health.combine(own)
 
     return lax.fori_loop(0, steps.length, visit, (state, steps.perfect()))
@@ -71,7 +72,7 @@ def _forward(steps: Steps, *inputs: Any) -> tuple[tuple[Any, Any], Any]:
     moving = jax.tree.map(
         lambda leaf, passive: _varies(leaf) if passive else _is_smooth(leaf), inputs[1], steps.passive
     )
-    room = _room(steps, shared, state)
+    room = _room(steps, shared, state, first)
     keep = steps.keep and _bytes(room[1]) <= _bytes(room[0])
 
     def block(carry, bounds):
@@ -79,9 +80,10 @@ def _forward(steps: Steps, *inputs: Any) -> tuple[tuple[Any, Any], Any]:
 
         def visit(i, carry):
             state, health, kept = carry
-            between = steps.begin(shared, state)
+            number = first + i
+            between = steps.begin(shared, state, number)
             kept = _put(kept, i - low, (state, between)) if keep else None
-            state, own = steps.end(shared, state, between, first + i)
+            state, own = steps.end(shared, state, between, number)
             return state, health.combine(own), kept
 
         after = lax.fori_loop(low, high, visit, carry)
@@ -101,12 +103,12 @@ def _backward(steps: Steps, residuals: Any, cotangents: Any) -> tuple[Any, Any, 
     def recomputed(number, low, high, kept):
         """States of a block, recomputed from its checkpoint."""
         state = _at(checkpoints, number)
-        between = _at(betweens, number) if keep else steps.begin(shared, state)
+        between = _at(betweens, number) if keep else steps.begin(shared, state, first + low)
 
         def visit(i, carry):
             state, between, kept = carry
             state, _ = steps.end(shared, state, between, first + i - 1)
-            between = steps.begin(shared, state)
+            between = steps.begin(shared, state, first + i)
             return state, between, _put(kept, i - low, (state, between))
 
         return lax.fori_loop(low + 1, high, visit, (state, between, _put(kept, 0, (state, between))))[-1]
@@ -116,7 +118,7 @@ def _backward(steps: Steps, residuals: Any, cotangents: Any) -> tuple[Any, Any, 
         varied, still = eqx.partition(state, moving)
 
         def begin(smooth, varied):
-            return steps.begin(eqx.combine(smooth, rest), eqx.combine(varied, still))
+            return steps.begin(eqx.combine(smooth, rest), eqx.combine(varied, still), first + step)
 
         def end(smooth, varied, between):
             after, _ = steps.end(eqx.combine(smooth, rest), eqx.combine(varied, still), between, first + step)
@@ -141,7 +143,7 @@ def _backward(steps: Steps, residuals: Any, cotangents: Any) -> tuple[Any, Any, 
 
         return lax.fori_loop(0, high - low, visit, cotangents), kept
 
-    kept = kept if keep else _room(steps, shared, _at(checkpoints, 0))
+    kept = kept if keep else _room(steps, shared, _at(checkpoints, 0), first)
     of_state = jax.tree.map(_instantiated, eqx.filter(cotangents[0], moving, is_leaf=_is_zero))
     cotangents = jax.tree.map(jnp.zeros_like, smooth), of_state
     (of_shared, of_state), _ = lax.fori_loop(0, last + 1, block, (cotangents, kept))
@@ -168,9 +170,9 @@ def _is_zero(cotangent: Any) -> bool:
     return isinstance(cotangent, SymbolicZero)
 
 
-def _room(steps: Steps, shared: Any, state: Any) -> tuple[Any, Any]:
+def _room(steps: Steps, shared: Any, state: Any, number: Int[Array, ""]) -> tuple[Any, Any]:
     """Room for the states of a block, and for the values between the halves of its steps."""
-    between = jax.eval_shape(steps.begin, shared, state)
+    between = jax.eval_shape(steps.begin, shared, state, number)
     return jax.tree.map(lambda like: jnp.zeros((steps.block, *like.shape), like.dtype), (state, between))
 
 

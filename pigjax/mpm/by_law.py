@@ -74,9 +74,15 @@ class Grouping(NamedTuple):
 
 
 def group_by_law(
-    particles: Particles, table: MaterialTable, grid: Grid, pieces: int, *, apart: bool = False
+    particles: Particles,
+    table: MaterialTable,
+    grid: Grid,
+    pieces: int,
+    *,
+    apart: bool = False,
+    weights: Float[Array, "p k"] | None = None,
 ) -> Grouping:
-    """Particles by law.
+    """Particles by law, with their weights by forces.
 
     The sizes are static, from `particles.counts`, made whole multiples of `pieces` by particles without mass.
 
@@ -96,11 +102,13 @@ def group_by_law(
         rank = jnp.asarray([laws.index(law) if law in laws else len(laws) for law in table.laws])
         order = order_of(rank[particles.material], len(laws) + 1)
 
-    parts = _split(particles if order is None else _reorder(particles, order), [sizes[law] for law in laws])
+    counts = [sizes[law] for law in laws]
+    parts = _split(particles if order is None else _reorder(particles, order), counts)
+    own = [None] * len(laws) if weights is None else _split(weights if order is None else weights[order], counts)
     moves = [LAWS[law].respond is not None for law in laws]
     pairs = [
-        _group(law, part, rows_of[law], table, grid, pieces, apart)
-        for law, part, moving in zip(laws, parts, moves)
+        _group(law, part, rows_of[law], table, grid, pieces, apart, weights)
+        for law, part, moving, weights in zip(laws, parts, moves, own)
         if moving
     ]
     still = next((part for part, moving in zip(parts, moves) if not moving), None)
@@ -128,7 +136,14 @@ def bound_visual(state: State, stretch: tuple[float, float]) -> State:
 
 
 def _group(
-    law: str, part: Particles, rows: list[int], table: MaterialTable, grid: Grid, pieces: int, apart: bool
+    law: str,
+    part: Particles,
+    rows: list[int],
+    table: MaterialTable,
+    grid: Grid,
+    pieces: int,
+    apart: bool,
+    weights: Float[Array, "p k"] | None,
 ) -> tuple[Group, State]:
     """Particles of one law with their present stress, at rest and without mass where they are not finite.
 
@@ -153,6 +168,7 @@ def _group(
         hardening=part.hardening,
         visual=None if kind.total else part.F_visual,
         row=None,
+        weights=weights,
     )
     given = jax.tree.map(lambda leaf: leaf.reshape(len(part), -1), given)
     rest = jax.tree.map(lambda _: 0.0, given)._replace(cells=(last + 1) / 2, F=eye, visual=None if kind.total else eye)
@@ -219,9 +235,9 @@ def _own_grid(part: Particles, grid: Grid) -> Float[Array, "p 3"]:
     return (part.body[:, None] * grid.shape[0] * np.eye(1, 3, dtype=int)).astype(part.x.dtype)
 
 
-def _split(particles: Particles, sizes: list[int]) -> list[Particles]:
+def _split(rows: Any, sizes: list[int]) -> list[Any]:
     ends = np.cumsum(sizes)
-    return [jax.tree.map(lambda a, low=end - size, high=end: a[low:high], particles) for size, end in zip(sizes, ends)]
+    return [jax.tree.map(lambda a, low=end - size, high=end: a[low:high], rows) for size, end in zip(sizes, ends)]
 
 
 def _reorder(particles: Particles, order: Int[Array, "p"]) -> Particles:

@@ -28,6 +28,7 @@ class Grid(eqx.Module):
 
     origin: Float[Array, "3"] = real_field()  # first node [m]
     dx: Float[Array, ""] = real_field(limits=Limits(0, above=True, unit="m"))  # spacing of the nodes [m]
+    # nodes along x, y, z, the wall included; 8 or more a side
     shape: tuple[int, int, int] = static_field(limits=Limits(1, LARGEST_WHOLE))
 
     def __check_init__(self) -> None:
@@ -51,10 +52,15 @@ class Grid(eqx.Module):
 
 @checked
 def fit_grid(x: Float[Array, "p 3"] | np.ndarray, dx: float, *, margin: float = 0.0) -> Grid:
-    """Grid around the particles with `margin` [m] of room inside its walls (host).
+    """Grid around the particles (host).
 
     Nodes lie on multiples of dx and sides have 2ᵏ or 3·2ᵏ nodes, so that a grid re-fitted to moved matter mostly
     has the old shape and always the old lattice.
+
+    Args:
+        x: positions of the particles [m]; those that are not finite are passed over.
+        dx: spacing of the nodes [m].
+        margin: room between the particles and the walls [m]; with 0 the walls stop them at once.
 
     Raises:
         InputError: no particle has a finite position, dx is not > 0, the margin is not >= 0, or the particles are so
@@ -86,6 +92,9 @@ def vast_grid(dx: float) -> Grid:
     """A domain of a million cells a side around the world's origin, for matter that no wall holds.
 
     Outside of jit, grad and vmap only its active part is ever allocated.
+
+    Args:
+        dx: spacing of the nodes [m].
     """
     nodes = 1 << 20
     return Grid(jnp.full(3, -(nodes // 2) * dx), jnp.asarray(dx, float), (nodes,) * 3)

@@ -32,6 +32,7 @@ class State(NamedTuple):
     hardening: Rows  # 1; None where the law has none
     visual: Rows  # total deformation, 9; None where F is that
     row: Rows  # of the material table, as a float, 1; None where the law has only one
+    weights: Rows = None  # by the forces that weight particles, one each; None where no force does
 
 
 def to_chunks(state: State, limit: int | None) -> State:

@@ -50,7 +50,7 @@ class Trajectory(eqx.Module):
 
     x: Float[Array, "t p 3"]  # [m]
     v: Float[Array, "t p 3"]  # [m/s]
-    F_visual: Float[Array, "t p 3 3"]
+    F_visual: Float[Array, "t p 3 3"]  # deformation since the start, plastic flow included: it poses splats
 
 
 @checked

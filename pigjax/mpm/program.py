@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.arrays import everywhere, in_precision
 from pigjax.core.errors import InputError
+from pigjax.core.regions import Region
 from pigjax.mpm import (
     Grid,
     Health,
@@ -34,11 +35,13 @@ from pigjax.mpm import (
 from pigjax.mpm.adjoint import Steps, run_steps
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.forces import Force, columns_of, weights_of, without_weights
 from pigjax.mpm.implicit.newton import balanced_velocity
 from pigjax.mpm.materials import MaterialTable
 from pigjax.mpm.substep import (
     StepContext,
     StepStatics,
+    apply_forces,
     grid_to_particles,
     particles_to_grid,
     substep,
@@ -64,9 +67,11 @@ class StepInputs(NamedTuple):
     dt: Float[Array, ""]  # of a substep [s]
     substeps: int  # of a frame; static
     gravity: Float[Array, "3"]  # [m/s²]
-    start: Float[Array, ""]  # time since the colliders were where their numbers say [s]
+    start: Float[Array, ""]  # time since the colliders were where their numbers say, by which forces go [s]
     colliders: tuple[Collider, ...] = ()
     contact: BodyContact | None = None  # between bodies; None: they share one velocity field
+    pins: tuple[Region, ...] = ()  # where matter does not move
+    forces: tuple[Force, ...] = ()  # beside gravity
 
     @property
     def duration(self) -> Float[Array, ""]:
@@ -107,7 +112,8 @@ def run_frames(
     kernel, dtype = KERNELS[config.kernel], particles.x.dtype
     window, table, inputs = in_precision((window, table, inputs), dtype)
     grid, contact = window.grid, inputs.contact
-    grouping = group_by_law(particles, table, grid, devices, apart=contact is not None)
+    weights = weights_of(inputs.forces)
+    grouping = group_by_law(particles, table, grid, devices, apart=contact is not None, weights=weights)
     states, bodies = grouping.states, 1 if contact is None else contact.bodies
     nodes = (bodies * grid.shape[0], *grid.shape[1:])
     # neighbours beside each other: in the cache, and on the same device
@@ -126,9 +132,10 @@ def run_frames(
         collider_contacts=tuple(None if c.moves else c.contact(points) for c in inputs.colliders),
         body_contact=contact,
         specific_volume=None if contact is None else _specific_volume(particles, contact.bodies) / grid.dx**3,
-        frozen=None if still is None else touched_nodes(grid, still.x, kernel),
+        frozen=_held_nodes(None if still is None else touched_nodes(grid, still.x, kernel), inputs.pins, points),
         unit_mass=lax.stop_gradient(jnp.where(jnp.isfinite(particles.mass), particles.mass, 0).max()),
         opaque_true=everywhere(~(particles.volume0[0] < -jnp.finfo(dtype).max)),  # true of NaN too
+        forces=without_weights(inputs.forces),
     )
     statics = StepStatics(
         kernel=kernel,
@@ -141,6 +148,7 @@ def run_frames(
         krylov_steps=config.krylov_steps,
         axis=_AXIS if devices > 1 else None,
         fillers=sum(-len(part) % devices for part, moves in zip(grouping.parts, grouping.moves) if moves),
+        force_columns=columns_of(inputs.forces),
     )
     run = partial(_frames, statics, config, frames, inputs.substeps, of or frames)
     if devices > 1:
@@ -188,7 +196,8 @@ def _frames(
         if config.stop:
             stopped = stopped | bad
             moved = jax.tree.map(lambda new, old: jnp.where(stopped, old, new), moved, states)
-        seen = tuple(s._replace(rounded=None, C=None, stress=None, mass=None, hardening=None, row=None) for s in moved)
+        unseen = dict.fromkeys(("rounded", "C", "stress", "mass", "hardening", "row", "weights"))
+        seen = tuple(state._replace(**unseen) for state in moved)
         return (moved, worst.combine(health), steps, stopped), (seen, bad)
 
     perfect = StepHealth.perfect(context.dt.dtype)
@@ -212,8 +221,10 @@ def _checkpointed_steps(
     `first` is the number of the first one, `frames` the number of frames of the whole simulation.
     """
 
-    def begin(shared, states):
-        return particles_to_grid(statics, shared[0], states)
+    def begin(shared, states, number):
+        context, start = shared
+        pushed = apply_forces(statics, context, states, start + number * context.dt) if context.forces else states
+        return particles_to_grid(statics, context, pushed)
 
     def end(shared, states, nodes, number):
         context, start = shared
@@ -238,7 +249,7 @@ def _checkpointed_steps(
     ), health
 
 
-_FIXED = ("mass", "volume", "row")  # no step changes them, but to zero where a particle is no longer finite
+_FIXED = ("mass", "volume", "row", "weights")  # no step changes them, but to zero where a particle is no longer finite
 
 
 def _plain_steps(
@@ -283,6 +294,16 @@ def _counted(statics: StepStatics, health: StepHealth, states: tuple[State, ...]
     escaped, inverted, wall_hits, gone = counts
     nonfinite = gone - statics.fillers
     return StepHealth(least, most, escaped, nonfinite, inverted, health.unconverged, wall_hits, sides_met=met)
+
+
+def _held_nodes(
+    touched: Bool[Array, "x y z"] | None, pins: tuple[Region, ...], points: Float[Array, "x y z 3"]
+) -> Bool[Array, "x y z"] | None:
+    """Nodes without velocity: those that stationary matter touches, and those in pinned regions; None for none."""
+    for region in pins:
+        inside = region.contains(points)
+        touched = inside if touched is None else touched | inside
+    return touched
 
 
 def _specific_volume(particles: Particles, bodies: int) -> Float[Array, "b"]:

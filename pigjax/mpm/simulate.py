@@ -15,10 +15,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from pigjax.core.regions import Region
 from pigjax.mpm import Grid, Health, Particles, SimConfig, StepHealth, Trajectory
 from pigjax.mpm.active_grid import ActiveGrid, devices_for, whole, window_around
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.forces import Force
 from pigjax.mpm.materials import MaterialTable
 from pigjax.mpm.program import StepInputs, run_frames
 from pigjax.mpm.timestep import SubstepRule
@@ -44,6 +46,8 @@ def simulate(
     gravity: Any,
     colliders: tuple[Collider, ...] = (),
     contact: BodyContact | None = None,
+    pins: tuple[Region, ...] = (),
+    forces: tuple[Force, ...] = (),
     active_grid: ActiveGrid | None = None,
 ) -> Iterator[SimulatedFrame]:
     """Simulate and yield frame after frame (host).
@@ -60,6 +64,8 @@ def simulate(
         gravity: [m/s²].
         colliders: as they are at the start of frame 0.
         contact: between bodies; None: they share one velocity field.
+        pins: regions in which matter does not move.
+        forces: beside gravity; their times count from the start of frame 0.
         active_grid: the active grid so far, such as one in which bodies sleep; None: a new one.
 
     Raises:
@@ -73,7 +79,7 @@ def simulate(
     for frame in frames:
         before, substeps = particles, rule.of_frame(particles, frame)
         dt, start = (jnp.asarray(time, dtype) for time in (frame_dt / substeps, frame_dt * frame))
-        inputs = StepInputs(dt, substeps, gravity, start, colliders, contact)
+        inputs = StepInputs(dt, substeps, gravity, start, colliders, contact, pins, forces)
         particles, moved, health = active_grid.frame(particles, domain, table, config, devices, inputs)
         stops = config.stop and bool(health.first_bad_frame >= 0)
         if stops and path is not None:  # the last good frame to the digit: another window would round positions again

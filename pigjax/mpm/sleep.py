@@ -2,8 +2,8 @@
 
 Bodies are those of `Particles.body`. Between frames the bounding boxes of moving bodies, grown by the kernel's reach
 and by the largest displacement of a frame, decide which bodies are awake: a body wakes before it is touched. Bodies
-that touch each other therefore sleep and wake together. A frame in which a body got farther than its speed had bounded
-is computed again, together with the bodies that it came near.
+that touch each other therefore sleep and wake together. A body that a force beside gravity acts on is awake. A frame in
+which a body got farther than its speed had bounded is computed again, together with the bodies that it came near.
 
 Each set of awake bodies is another compilation, so that sleep pays in long simulations of few bodies.
 """
@@ -24,6 +24,7 @@ from pigjax.core.checks import LARGEST_WHOLE, Limits, check_fields
 from pigjax.mpm import Grid, Health, Particles, SimConfig, StepHealth, Trajectory
 from pigjax.mpm.active_grid import ActiveGrid, devices_for
 from pigjax.mpm.colliders import Collider, Time
+from pigjax.mpm.forces import of_some
 from pigjax.mpm.materials import MaterialTable
 from pigjax.mpm.program import StepInputs
 from pigjax.mpm.transfers import KERNELS
@@ -102,7 +103,7 @@ class Sleeper(ActiveGrid):
         ready = self.still >= self._needed(bounds, inputs)
         # at every few frames only, so that bodies that come to rest one after another cost one compilation
         leaving = ready if self.frames % self.settings.frames == 0 else np.zeros_like(ready)
-        awake = ~(self.asleep | leaving) | bounds.met_by_colliders
+        awake = ~(self.asleep | leaving) | bounds.driven
         grow = bounds.farthest(awake)
         while (more := bounds.near(awake, bounds.low, bounds.high, grow)).any():
             awake = awake | more
@@ -138,6 +139,7 @@ class Sleeper(ActiveGrid):
         part = jax.tree.map(lambda leaf: leaf[index], particles)
         part = replace(part, counts=tuple(np.bincount(np.asarray(part.material), minlength=len(table)).tolist()))
         devices = min(devices, devices_for(config, len(index)))
+        inputs = inputs._replace(forces=of_some(inputs.forces, index))
         moved, path, health = super().frame(part, domain, table, config, devices, inputs)
         merged = [_put(getattr(particles, name), index, getattr(moved, name)) for name in _STATE]
         whole = eqx.tree_at(lambda p: [getattr(p, name) for name in _STATE], particles, merged)
@@ -204,7 +206,7 @@ class _Bounds:
     low: Float[np.ndarray, "b 3"]  # [m]
     high: Float[np.ndarray, "b 3"]
     speed: Float[np.ndarray, "b"]  # of each body's fastest particle [m/s]
-    met_by_colliders: Bool[np.ndarray, "b"]  # in this frame, by colliders that move
+    driven: Bool[np.ndarray, "b"]  # in this frame, by colliders that move or by forces
     collider_speed: float  # of the fastest [m/s]
     reach: float  # of the kernel [m]
     dx: float  # [m]
@@ -228,6 +230,8 @@ class _Bounds:
                 near, top = _met(collider, particles.x, span, float(inputs.start), duration, math.sqrt(3) * reach)
                 met |= bodies.most(near)
                 fastest = max(fastest, top)
+        for force in inputs.forces:
+            met |= bodies.most(force.touches(particles.x, float(inputs.start), duration))
         fall = float(np.linalg.norm(inputs.gravity)) * duration**2 / 2
         return cls(low, high, speed, met, fastest, reach, dx, duration, fall)
 

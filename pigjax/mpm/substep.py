@@ -1,7 +1,8 @@
 """One substep of MLS-MPM with APIC: `particles_to_grid` (P2G), `update_grid`, `grid_to_particles` (G2P).
 
-The same three functions serve forward simulation and the adjoint, which keeps the grid between the first and the
-second. `reference.py` has the same stages under the same names in plain form, without chunks or devices.
+Forces on particles come before P2G (`apply_forces`). The same functions serve forward simulation and the adjoint, which
+keeps the grid between the first and the second. `reference.py` has the same stages under the same names in plain form,
+without forces, chunks or devices.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from pigjax.mpm.by_law import by_component, by_row
 from pigjax.mpm.chunked import ChunkLoop, gather_chunks, scatter_chunks
 from pigjax.mpm.colliders import Collider, Contact, Press, Time
 from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.forces import Force, Matter
 from pigjax.mpm.health import LaneHealth
 from pigjax.mpm.materials import Parameters, respond
 from pigjax.mpm.materials.tensors import determinant, product
@@ -56,6 +58,7 @@ class StepStatics(NamedTuple):
     krylov_steps: int
     axis: str | None  # name of the devices that share the particles
     fillers: int  # particles without mass that even out the devices' shares
+    force_columns: tuple[int | None, ...] = ()  # row of `State.weights` that each force reads
 
 
 class StepContext(NamedTuple):
@@ -71,9 +74,10 @@ class StepContext(NamedTuple):
     collider_contacts: tuple[Contact | None, ...]  # of the colliders that do not move; None: found at each step
     body_contact: BodyContact | None  # between bodies, each of which has a grid of its own beside the others
     specific_volume: Float[Array, "b"] | None  # of each body, on average [cells/kg]
-    frozen: Bool[Array, "nx ny nz"] | None  # nodes that stationary matter touches
+    frozen: Bool[Array, "nx ny nz"] | None  # nodes that stationary matter touches, or that are pinned
     unit_mass: Float[Array, ""]  # of the heaviest particle [kg]
     opaque_true: Bool[Array, ""]  # for `transfers.no_fuse`
+    forces: tuple[Force, ...] = ()  # beside gravity; particles carry their weights
 
     @property
     def bodies(self) -> int:
@@ -91,9 +95,39 @@ def substep(
     statics: StepStatics, context: StepContext, states: tuple[State, ...], time: Time
 ) -> tuple[tuple[State, ...], StepHealth]:
     """One step of all groups of particles, begun at a time [s]; returns their states and the health of the step."""
-    nodes = particles_to_grid(statics, context, states)
+    nodes = particles_to_grid(statics, context, apply_forces(statics, context, states, time))
     velocity, converged = update_grid(statics, context, states, nodes, time)
     return grid_to_particles(statics, context, states, velocity, converged)
+
+
+def apply_forces(
+    statics: StepStatics, context: StepContext, states: tuple[State, ...], time: Time
+) -> tuple[State, ...]:
+    """Particles with the velocities that forces other than gravity and stress give them in the step.
+
+    Each force sees the velocities before all forces, so that their order does not matter.
+    """
+    changed = states
+    for force, column in zip(context.forces if states else (), statics.force_columns):
+        with jax.named_scope(type(force).__name__.lower()):
+            matter = [_matter(context, force, column, state) for state in states]
+            totals = jax.tree.map(lambda *parts: sum(parts), *map(force.totals, matter))
+            totals = totals if statics.axis is None else lax.psum(totals, statics.axis)
+            changes = [force.change(own, totals, context.dt, time) for own in matter]
+            changed = tuple(state._replace(v=state.v + jnp.swapaxes(dv, 1, 2)) for state, dv in zip(changed, changes))
+    return changed
+
+
+def _matter(context: StepContext, force: Force, column: int | None, state: State) -> Matter:
+    """Particles of one law as a force meets them; those without mass take no part."""
+    cells, width = state.cells, context.grid.shape[0]
+    if context.bodies > 1:
+        cells = cells - jnp.floor(cells[:, :1] / width) * width * np.eye(3, 1, dtype=cells.dtype)
+    x = context.grid.origin + context.grid.dx * jnp.swapaxes(cells, 1, 2)
+    mass = jnp.swapaxes(state.mass, 1, 2)
+    acts = mass > 0 if force.region is None else (mass > 0) & force.region.contains(x)[..., None]
+    weight = jnp.ones_like(mass) if column is None else state.weights[:, column, :, None]
+    return Matter(x, jnp.swapaxes(state.v, 1, 2), mass, jnp.where(acts, weight, 0.0))
 
 
 def particles_to_grid(statics: StepStatics, context: StepContext, states: tuple[State, ...]) -> Float[Array, "x y z 4"]:
@@ -370,11 +404,11 @@ def apply_boundaries(
     time: Time,
     press: Sequence[Press] | None = None,
 ) -> Float[Array, "n y z 3"]:
-    """Velocities of the nodes [m/s] after colliders, stationary matter and the walls of the domain.
+    """Velocities of the nodes [m/s] after colliders, stationary matter, pins and the walls of the domain.
 
     Args:
         statics: the walls' mode.
-        context: colliders, nodes that stationary matter touches, and the window of the domain.
+        context: colliders, nodes that stationary matter touches or that are pinned, and the window of the domain.
         velocity: of the nodes, of each body if there are several [m/s].
         time: since the colliders were where their numbers say [s].
         press: how nodes press against each collider, if friction must follow that; None: by their velocity.

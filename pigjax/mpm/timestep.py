@@ -18,6 +18,7 @@ from pigjax.core.errors import InputError
 from pigjax.mpm import Grid, Particles, SimConfig, fit_grid
 from pigjax.mpm.active_grid import LARGEST
 from pigjax.mpm.colliders import Collider
+from pigjax.mpm.forces import Force
 from pigjax.mpm.materials import MaterialTable
 
 _COST_OF_IMPLICIT = 400  # explicit steps in the time of an implicit one, by benchmarks/implicit.py
@@ -37,7 +38,7 @@ def stable_dt(
     """Longest stable step [s].
 
     Explicit: Δt = cfl min(dx / (c + v), dx² / 4ν) with c the fastest pressure wave, v the speed of matter and ν the
-    largest kinematic viscosity (the bound of Courant, Friedrichs and Lewy, and that of diffusion). Implicit:
+    largest kinematic viscosity (the bound of Courant, Friedrichs and Lewy (1928), and that of diffusion). Implicit:
     Δt = cfl dx / v.
 
     Args:
@@ -72,10 +73,21 @@ def choose_integrator(
     frame_dt: Float[Array, ""] | float,
     gravity: Vector,
     colliders: tuple[Collider, ...] = (),
+    forces: tuple[Force, ...] = (),
 ) -> SimConfig:
     """The configuration with its integrator "auto" decided (host): the one with the lower cost.
 
-    An implicit step costs about as much as 400 explicit ones. The other arguments are those of `choose_substeps`.
+    An implicit step costs about as much as 400 explicit ones.
+
+    Args:
+        particles: at the start.
+        grid: the whole domain.
+        table: materials.
+        config: returned as it is unless its integrator is "auto".
+        frames: number of frames, 1 or more.
+        frame_dt: duration of a frame [s].
+        gravity: [m/s²].
+        colliders: as they are at the start.
 
     Raises:
         InputError: a number is out of range, or no step is stable.
@@ -92,6 +104,7 @@ def choose_integrator(
             frame_dt=frame_dt,
             gravity=gravity,
             colliders=colliders,
+            forces=forces,
         )
         for integrator in ("explicit", "implicit")
     )
@@ -109,6 +122,7 @@ def choose_substeps(
     frame_dt: Float[Array, ""] | float,
     gravity: Vector,
     colliders: tuple[Collider, ...] = (),
+    forces: tuple[Force, ...] = (),
 ) -> int:
     """Substeps per frame that keep a rollout stable (host).
 
@@ -125,17 +139,28 @@ def choose_substeps(
         frame_dt: duration of a frame [s].
         gravity: [m/s²].
         colliders: as they are at the start.
+        forces: beside gravity; the speed that they can give adds to that of the fall.
 
     Raises:
         InputError: a number is out of range, or no step is stable.
     """
     check_steps(frames, frame_dt, gravity)
     config = choose_integrator(
-        particles, grid, table, config, frames=frames, frame_dt=frame_dt, gravity=gravity, colliders=colliders
+        particles,
+        grid,
+        table,
+        config,
+        frames=frames,
+        frame_dt=frame_dt,
+        gravity=gravity,
+        colliders=colliders,
+        forces=forces,
     )
     duration = float(frame_dt)
     time = frames * duration
-    needed = _substeps_needed(particles, grid, table, config, duration, gravity, colliders, fall=time, until=time)
+    needed = _substeps_needed(
+        particles, grid, table, config, duration, gravity, colliders, forces, fall=time, until=time
+    )
     unit = 2 ** max(needed.bit_length() - 4, 0)
     return max(-(-needed // unit) * unit, 1)
 
@@ -151,6 +176,7 @@ class SubstepRule(NamedTuple):
     frame_dt: float  # [s]
     gravity: Any  # [m/s²]
     colliders: tuple[Collider, ...]
+    forces: tuple[Force, ...] = ()
 
     def of_frame(self, particles: Particles, frame: int) -> int:
         """Substeps of a frame, numbered from 0, that begins with these particles.
@@ -170,6 +196,7 @@ class SubstepRule(NamedTuple):
             frame_dt=self.frame_dt,
             gravity=self.gravity,
             colliders=self.colliders,
+            forces=self.forces,
         )
 
 
@@ -183,6 +210,7 @@ def substep_rule(
     frame_dt: Float[Array, ""] | float,
     gravity: Vector,
     colliders: tuple[Collider, ...] = (),
+    forces: tuple[Force, ...] = (),
 ) -> SubstepRule:
     """The rule for a simulation that begins with these particles (host): `config.substeps`, or the fewest stable ones.
 
@@ -195,16 +223,13 @@ def substep_rule(
     """
     chosen = config.substeps is None
     near = _near(particles, grid) if chosen and is_open(grid) else grid
-    config = choose_integrator(
-        particles, near, table, config, frames=frames, frame_dt=frame_dt, gravity=gravity, colliders=colliders
-    )
+    given: dict[str, Any] = {"frames": frames, "frame_dt": frame_dt, "gravity": gravity, "colliders": colliders}
+    config = choose_integrator(particles, near, table, config, forces=forces, **given)
     first = config.substeps
     if first is None:
-        first = choose_substeps(
-            particles, near, table, config, frames=frames, frame_dt=frame_dt, gravity=gravity, colliders=colliders
-        )
+        first = choose_substeps(particles, near, table, config, forces=forces, **given)
     adaptive = chosen and is_open(grid)
-    return SubstepRule(config, first, adaptive, grid, table, float(frame_dt), gravity, colliders)
+    return SubstepRule(config, first, adaptive, grid, table, float(frame_dt), gravity, colliders, forces)
 
 
 def frame_substeps(
@@ -218,6 +243,7 @@ def frame_substeps(
     frame_dt: float,
     gravity: Vector,
     colliders: tuple[Collider, ...] = (),
+    forces: tuple[Force, ...] = (),
 ) -> int:
     """Substeps of one frame, numbered from 0, by the speeds at its beginning (host).
 
@@ -226,7 +252,9 @@ def frame_substeps(
     the same number.
     """
     until = (frame + 1) * frame_dt
-    needed = _substeps_needed(particles, grid, table, config, frame_dt, gravity, colliders, fall=frame_dt, until=until)
+    needed = _substeps_needed(
+        particles, grid, table, config, frame_dt, gravity, colliders, forces, fall=frame_dt, until=until
+    )
     ladder = (size << k for k in range(64) for size in (2 * first, 3 * first))
     return next(-(-size // 2) for size in ladder if size >= 2 * needed)
 
@@ -239,15 +267,20 @@ def _substeps_needed(
     frame_dt: float,
     gravity: Vector,
     colliders: tuple[Collider, ...],
+    forces: tuple[Force, ...],
     *,
     fall: float,
     until: float,
 ) -> int:
-    """The fewest stable substeps where matter falls for at most `fall` [s] and colliders move until a time [s]."""
+    """The fewest stable substeps where matter falls for at most `fall` [s] and colliders move until a time [s].
+
+    Forces act from `fall` before that time.
+    """
     pull = float(np.linalg.norm(gravity))
     height = float(grid.dx) * math.hypot(*grid.shape)
     speed = _max_speed(particles, colliders, grid, until, displacement=lambda v: v * fall + pull * fall**2 / 2)
     speed = min(speed + pull * fall, math.sqrt(speed**2 + 2 * pull * height))
+    speed += sum(force.speed_gain(particles, until - fall, fall, height) for force in forces)
     limit = float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl, integrator=config.integrator))
     needed = frame_dt / limit * (1 - 1e-6) if limit > 0 else math.inf
     if not needed < _MOST_SUBSTEPS:

@@ -23,7 +23,7 @@ def contributions(
     cameras: Camera,
     config: RenderConfig = RenderConfig(),
 ) -> Float[Array, "n"]:
-    """Contribution of each Gaussian to the views: the sum of its alpha·T over all pixels.
+    """Contribution of each Gaussian to the views: the sum of its alpha·T over all pixels (Kerbl et al. 2023).
 
     Args:
         gaussians: the scene.

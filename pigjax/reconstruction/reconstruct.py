@@ -109,6 +109,8 @@ def reconstruct(
     """
     # with a capacity, splats would be dropped silently
     config = replace(config, render=replace(config.render, capacity=None, differentiation="reverse"))
+    if (config.object_id is not None or config.random_background) and views.masks is not None:
+        views = views.masked  # a view without a mask says nothing of where the object is
     train, held_out = views.training, views.held_out
     if points is None:
         points = random_points(train.cameras, min(config.splats, 5000), seed=config.seed)

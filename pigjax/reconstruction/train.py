@@ -36,7 +36,9 @@ class FitConfig(eqx.Module):
     splats: int = static_field(default=15_000, limits=Limits(4, LARGEST_WHOLE))
     # number at the start, doubled every `grow_every` steps up to `splats`; None: `splats`
     start_splats: int | None = static_field(default=None, limits=Limits(4, LARGEST_WHOLE))
+    # steps; with the default, counts from 2,000 reach 15,000 within half of the steps
     grow_every: int = static_field(default=500, limits=Limits(1, LARGEST_WHOLE))
+    # highest SH degree; 3 needs four times the memory of 1
     sh_degree: int = static_field(default=1, limits=Limits(0, 3))
     ssim_weight: float = static_field(default=0.2, limits=Limits(0, 1))  # 0 traces no SSIM
     background: float = static_field(default=0.0, limits=Limits(0, 1))  # grey level behind the splats, as in the photos
@@ -47,8 +49,11 @@ class FitConfig(eqx.Module):
     pose_rate: float = static_field(default=0.0, limits=Limits(0, 1e3))
     # of the centres, times the extent of the points; decays to a hundredth
     means_rate: float = static_field(default=4e-4, limits=Limits(0, 1e3))
+    # of the logarithms of the scales
     scales_rate: float = static_field(default=1e-2, limits=Limits(0, 1e3))
+    # of the quaternions
     quats_rate: float = static_field(default=2e-3, limits=Limits(0, 1e3))
+    # of the logits of the opacities
     opacities_rate: float = static_field(default=5e-2, limits=Limits(0, 1e3))
     sh_rate: float = static_field(default=5e-3, limits=Limits(0, 1e3))  # a twentieth of it for the bands above 0
     # steps between one SH band and the next
@@ -57,12 +62,16 @@ class FitConfig(eqx.Module):
     relocate_until: float = static_field(default=0.8, limits=Limits(0, 1))  # share of the steps
     # on the centres, times their rate, per squared extent; 0 traces none
     noise: float = static_field(default=200.0, limits=Limits(0, 1e9))
+    # weight of the mean opacity in the loss, as in 3DGS-MCMC; 0 traces none
     opacity_regularizer: float = static_field(default=0.002, limits=Limits(0, 1e6))
     scale_regularizer: float = static_field(default=0.002, limits=Limits(0, 1e6))  # per extent of the points
+    # steps between held-out scores, where there are held-out views
     evaluate_every: int = static_field(default=500, limits=Limits(1, LARGEST_WHOLE))
     # steps between pictures of a view; 0 for none
     preview_every: int = static_field(default=0, limits=Limits(0, LARGEST_WHOLE))
+    # of the order of the photos, the noise and the relocation
     seed: int = static_field(default=0, limits=Limits(0, LARGEST_WHOLE - 2))
+    # of the renderer; its SH degree is that of the step
     render: RenderConfig = static_field(default=RenderConfig())
 
     def __check_init__(self) -> None:

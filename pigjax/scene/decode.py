@@ -19,7 +19,10 @@ _WHOLE = Limits(0, LARGEST_WHOLE)
 
 
 class Section(Struct, forbid_unknown_fields=True, frozen=True):
-    """A table of a file. Its fields' annotations hold types, choices and `Limits`."""
+    """A table of a file. Its fields' annotations hold types, choices and `Limits`.
+
+    A union of sections is told apart by their field `kind`, a `Literal` of one name.
+    """
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """Rules between fields: the dotted field to name, whether the rule holds, and the rule in words."""
@@ -140,6 +143,8 @@ def _value(value: Any, kind: Any, name: str) -> Any:
     bare = _bare(kind)
     if isinstance(bare, type) and issubclass(bare, Section):
         return decode(value, bare, name)
+    if sections := sections_of(bare):
+        return decode(value, _chosen(value, sections, name), name)
     if get_origin(bare) is dict and get_args(bare)[1] is not Any:
         if not isinstance(value, Mapping):
             raise SceneError(f"{name} = {shown(value)}: it must be a table.")
@@ -156,6 +161,28 @@ def _value(value: Any, kind: Any, name: str) -> Any:
         raise SceneError(f"{name}{at} = {shown(_item(value, at))}: it must be {wanted(kind)}.") from None
     _check(made, limits_of(kind), name)
     return made
+
+
+def sections_of(kind: Any) -> list[type[Section]]:
+    """The sections of a union; empty for any other type."""
+    if get_origin(kind) not in (Union, types.UnionType):
+        return []
+    return [arg for arg in get_args(kind) if isinstance(arg, type) and issubclass(arg, Section)]
+
+
+def _chosen(value: Any, sections: list[type[Section]], name: str) -> type[Section]:
+    """The only section, or the one that the table's `kind` names."""
+    if len(sections) == 1:
+        return sections[0]
+    kinds = {get_args(field.type)[0]: one for one in sections for field in fields(one) if field.name == "kind"}
+    if not isinstance(value, Mapping):
+        raise SceneError(f"{name} = {shown(value)}: it must be a table.")
+    if "kind" not in value:
+        raise SceneError(f"{joined(name, 'kind')} is missing: give one of {', '.join(kinds)}.")
+    kind = value["kind"]
+    if not isinstance(kind, str) or kind not in kinds:
+        raise SceneError(f"{joined(name, 'kind')} = {shown(kind)}: {suggest(kind, kinds)}.")
+    return kinds[kind]
 
 
 def _check(made: Any, limits: Limits, name: str) -> None:

@@ -58,7 +58,7 @@ def summary(records: Mapping[int, Record]) -> dict[str, Any]:
 
 
 def remarks(health: Mapping[str, Any], *, driven: bool) -> list[str]:
-    """Problems, in sentences that name a remedy; `driven` says that colliders move and may do work."""
+    """Problems, in sentences that name a remedy; `driven` says that colliders move, or forces act, and may do work."""
     if not health:
         return []
     found = []

@@ -24,9 +24,11 @@ from pigjax.mls_mpm import SimConfig
 from pigjax.mpm import Particles
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.forces import Force
 from pigjax.mpm.materials import Material, MaterialTable
 from pigjax.mpm.sleep import Sleep
 from pigjax.objects.lifting import lift
+from pigjax.scene.forces import forces_of
 from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, RenderConfig
@@ -52,6 +54,7 @@ class Plan:
     binding: Binding | None
     colliders: tuple[Collider, ...]
     contact: BodyContact | None
+    forces: tuple[Force, ...]  # beside gravity
     sleep: Sleep | None
     gravity: Float[np.ndarray, "3"]
     config: SimConfig
@@ -75,7 +78,9 @@ def read_inputs(scene: Scene) -> Inputs:
     views = None
     if spec.views is not None:
         masks = True if spec.masks is None else scene.path(spec.masks)
-        views = io.load_views(scene.path(spec.views), masks=masks, max_size=spec.max_size, origin=spec.origin)
+        views = io.load_views(
+            scene.path(spec.views), masks=masks, missing_masks="abstain", max_size=spec.max_size, origin=spec.origin
+        )
     if scene.camera.view is not None:
         _camera_of_view(scene.camera, views)
     return Inputs(gaussians, views, ids, names)
@@ -113,7 +118,7 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
         ids = jnp.asarray(sorted({0, only}), jnp.int32)
         votes = jnp.zeros((count, len(ids)), jnp.int32)
         return Labels(jnp.full(count, only, jnp.int32), votes, jnp.ones(count), ids=ids)
-    views = inputs.views.training
+    views = inputs.views.voters
     assert views.masks is not None
     check_ids_occur(inputs.ids, views.masks)
     labels = lift(
@@ -190,6 +195,7 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         binding=binding if len(binding) else None,
         colliders=colliders,
         contact=_contact(spec, len(moving)),
+        forces=forces_of(scene.forces, particles, {name: number for number, name in enumerate(moving)}),
         sleep=None if spec.sleep is None else Sleep(speed=spec.sleep),
         gravity=vector,
         config=SimConfig(kernel=spec.kernel, cfl=spec.cfl, integrator=spec.integrator),

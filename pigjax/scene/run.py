@@ -130,6 +130,7 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
         "colliders": [type(c).__name__ for c in plan.colliders],
         "kernel": plan.config.kernel,
         "clamp": scene.clamp.mode,
+        "forces": [type(force).__name__ for force in plan.forces],
         "body_contact": plan.contact is not None,
         "sleep": plan.sleep is not None,
         "sh_coefficients": inputs.gaussians.sh.shape[1],
@@ -177,6 +178,7 @@ def _simulate(
         frame_dt=plan.frame_dt,
         gravity=plan.gravity,
         colliders=plan.colliders,
+        forces=plan.forces,
     )
     run = partial(
         simulate,
@@ -187,6 +189,7 @@ def _simulate(
         gravity=plan.gravity,
         colliders=plan.colliders,
         contact=plan.contact,
+        forces=plan.forces,
         active_grid=active,
     )
     saved = io.resumed(checkpoint, (np.zeros((), np.int64), particles, active.memory()), parts=parts)
@@ -235,7 +238,8 @@ def _simulate(
     most = max((int(record["substeps"]) for frame, record in records.items() if frame), default=rule.first)
     report.sizes |= {"substeps_per_frame": most, "last_grid": active.shape, "resumed_from_frame": last}
     report.health |= summary(records)
-    report.warnings += remarks(report.health, driven=any(collider.moves for collider in plan.colliders))
+    driven = bool(plan.forces) or any(collider.moves for collider in plan.colliders)
+    report.warnings += remarks(report.health, driven=driven)
     if isinstance(active, Sleeper):
         report.sizes["asleep_at_the_end"] = int(active.asleep.sum())
 

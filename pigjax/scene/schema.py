@@ -20,6 +20,7 @@ from pigjax.mpm.contact import broken_by
 from pigjax.mpm.materials import LAWS, PRESETS, Material, Parameters
 from pigjax.scene.accuracy import LEVELS, Accuracy, with_level
 from pigjax.scene.decode import Section, decode, merged
+from pigjax.scene.forces import AnyForce
 from pigjax.splatting.types import RenderConfig
 
 Triple = tuple[float, float, float]
@@ -274,6 +275,7 @@ class Scene(Section, frozen=True):
     spheres: dict[str, SphereSpec] = field(default_factory=dict)  # colliders by name
     capsules: dict[str, CapsuleSpec] = field(default_factory=dict)  # colliders by name
     cylinders: dict[str, CylinderSpec] = field(default_factory=dict)  # colliders by name
+    forces: dict[str, AnyForce] = field(default_factory=dict)  # beside gravity, by name
     folder: str = "."  # set by `load_scene`; the base of relative paths
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
@@ -286,6 +288,12 @@ class Scene(Section, frozen=True):
                 owner = owners.setdefault(spec.id, name)
                 rule = f"{spec.id} is the id of objects.{joined(owner)}, too; each object has an id of its own"
                 yield joined("objects", name, "id"), owner == name, rule
+        moving_names = [name for name, spec in self.objects.items() if not spec.fixed]
+        for name, force in self.forces.items():
+            for entry in force.objects or ():
+                known = entry in moving_names
+                rule = f"{entry!r} is no object that moves; {suggest(entry, moving_names)}"
+                yield joined("forces", name, "objects"), known, rule
         has_views = self.input.views is not None
         yield "input.views", has_views or len(self.objects) == 1, "several objects need photos with masks; give them"
         yield "camera.view", has_views or self.camera.view is None, "photos have cameras; give input.views, or an orbit"
@@ -374,6 +382,8 @@ def scene_from(
             if not spec.fixed:
                 spec.to_material(name)
         scene.colliders()
+        for name, force in scene.forces.items():
+            force.to_force(joined("forces", name))
     except SceneError as error:
         raise SceneError(f"{where}: {error}") from error.__cause__
     return scene

@@ -90,6 +90,7 @@ class RenderConfig(eqx.Module):
         InputError: a number is not finite or out of range, a choice does not exist, or alpha_min >= alpha_max.
     """
 
+    # edge of the square tiles that share a list of splats; 16 as in 3DGS
     tile_size: int = static_field(default=16, limits=Limits(1, 1024, unit="px"))
     # splat/tile pairs per image, far splats dropped first; None: unlimited ("forward": 16 per splat)
     capacity: int | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))

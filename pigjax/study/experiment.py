@@ -32,6 +32,7 @@ from pigjax.mpm import Grid, Health, Particles, Trajectory, fit_grid, vast_grid
 from pigjax.mpm.active_grid import box_for
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.forces import Force
 from pigjax.mpm.materials import Material, MaterialTable, Parameters
 from pigjax.mpm.timestep import stable_dt, substep_rule
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, render_config, segment
@@ -40,6 +41,7 @@ from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, RenderConfig, Splats, render
 
 _NUMBERS = tuple(field.name for field in fields(Parameters))
+_NO_PARAMETERS = ("elapsed", "weights", "region")  # of colliders and forces
 _CLAMP = ("tau_min", "tau_max", "lambda_R", "lambda_S")
 
 
@@ -61,6 +63,7 @@ class Experiment(eqx.Module):
     binding: Binding | None  # of Gaussians without a particle; None: there are none
     grid: Grid  # holds the motion of all `extremes`
     colliders: tuple[Collider, ...]  # in the order of `solids`
+    forces: tuple[Force, ...]  # in the order of `pushes`
     contact: BodyContact | None  # between objects; None: one velocity field
     gravity: Float[Array, "3"]  # [m/s²]
     frame_dt: Float[Array, ""]  # [s]
@@ -73,6 +76,7 @@ class Experiment(eqx.Module):
     frames: int = eqx.field(static=True)  # of the simulation; the video has one more
     rows: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)  # of the table, by moving object
     solids: tuple[str, ...] = eqx.field(static=True)  # names of the colliders: "objects.table", "planes.ground"
+    pushes: tuple[str, ...] = eqx.field(static=True)  # names of the forces: "forces.breeze"
 
     def with_parameters(self, values: Mapping[str, Any]) -> Experiment:
         """The same experiment with other numbers, by the names of the scene file.
@@ -98,8 +102,8 @@ class Experiment(eqx.Module):
             return getattr(self.clamp, field)
         if kind == "simulation":
             return self.contact.friction if self.contact and field == "contact_friction" else getattr(self, field)
-        if name.rpartition(".")[0] in self.solids:
-            own = getattr(self.colliders[self.solids.index(f"{kind}.{middle}")], field)
+        if (thing := self._thing(kind, middle)) is not None:
+            own = getattr(thing, field)
             if own is None:
                 raise SceneError(f"{name}: the scene gives it no value; state one in the scene file.")
             return own
@@ -114,10 +118,10 @@ class Experiment(eqx.Module):
         """Every parameter that `with_parameters` takes."""
         own = [f"objects.{name}.{field}" for name, _ in self.rows for field in ("velocity", *_NUMBERS)]
         numbers = [
-            f"{solid}.{field.name}"
-            for solid, collider in zip(self.solids, self.colliders)
-            for field in fields(collider)
-            if not field.metadata.get("static", False) and field.name != "elapsed"
+            f"{name}.{field.name}"
+            for name, thing in zip((*self.solids, *self.pushes), (*self.colliders, *self.forces))
+            for field in fields(thing)
+            if not field.metadata.get("static", False) and field.name not in _NO_PARAMETERS
         ]
         simulation = ["gravity", "frame_dt", *(["contact_friction"] if self.contact is not None else [])]
         return (*own, *(f"clamp.{f}" for f in _CLAMP), *(f"simulation.{f}" for f in simulation), *numbers)
@@ -150,6 +154,7 @@ class Experiment(eqx.Module):
             gravity=self.gravity,
             colliders=self.colliders,
             contact=self.contact,
+            forces=self.forces,
         )
         return Outcome(self, end, trajectory, health)
 
@@ -194,6 +199,11 @@ class Experiment(eqx.Module):
         entry, _, field = rest.rpartition(".")
         return section, entry, field
 
+    def _thing(self, section: str, entry: str) -> Collider | Force | None:
+        """The collider or force of a name; None for all else."""
+        things = dict(zip((*self.solids, *self.pushes), (*self.colliders, *self.forces)))
+        return things.get(f"{section}.{entry}")
+
     def _with(self, name: str, value: Array) -> Experiment:
         section, entry, field = self._split(name)
         self._check_shape(name, value)
@@ -202,10 +212,10 @@ class Experiment(eqx.Module):
             return replace(self, clamp=replace(self.clamp, **change))
         if section == "simulation":
             return self._with_simulation(field, value)
-        if f"{section}.{entry}" in self.solids:
-            at = self.solids.index(f"{section}.{entry}")
-            solid = replace(self.colliders[at], **change)
-            return replace(self, colliders=(*self.colliders[:at], solid, *self.colliders[at + 1 :]))
+        if (thing := self._thing(section, entry)) is not None:
+            kind = "forces" if section == "forces" else "colliders"
+            made = replace(thing, **change)
+            return replace(self, **{kind: tuple(made if own is thing else own for own in getattr(self, kind))})
         rows = np.array(dict(self.rows)[entry])
         particles = self.particles
         if field == "velocity":
@@ -220,11 +230,11 @@ class Experiment(eqx.Module):
     def _check_shape(self, name: str, value: Array) -> None:
         """Whether a value is one number for all, or as many as the parameter has."""
         section, entry, field = self._split(name)
-        solid = f"{section}.{entry}" in self.solids
-        if solid and getattr(self.colliders[self.solids.index(f"{section}.{entry}")], field) is None:
+        thing = self._thing(section, entry)
+        if thing is not None and getattr(thing, field) is None:
             return
         wanted = self.value(name).shape
-        spread = value.ndim == 0 and not solid
+        spread = value.ndim == 0 and thing is None
         if not spread and value.shape != wanted:
             needed = f"shape {wanted}" if wanted else "one number"
             raise SceneError(f"parameter {name}: its value has shape {value.shape}; {needed} is needed.")
@@ -315,6 +325,7 @@ def _assemble(scene: Scene, inputs: Inputs, plan: Plan) -> Experiment:
         binding=plan.binding,
         grid=vast_grid(spec.dx),
         colliders=plan.colliders,
+        forces=plan.forces,
         contact=plan.contact,
         gravity=jnp.asarray(plan.gravity, dtype),
         frame_dt=jnp.asarray(plan.frame_dt, dtype),
@@ -327,6 +338,7 @@ def _assemble(scene: Scene, inputs: Inputs, plan: Plan) -> Experiment:
         frames=spec.frames,
         rows=tuple((name, (row,)) for row, name in enumerate(moving)),
         solids=tuple(solids),
+        pushes=tuple(f"forces.{name}" for name in scene.forces),
     )
 
 
@@ -367,6 +379,7 @@ def _fitted(made: Experiment, dx: float, extremes: list[Mapping[str, Any]], marg
         frame_dt=float(made.frame_dt),
         gravity=np.asarray(made.gravity),
         colliders=made.colliders,
+        forces=made.forces,
     ).config
     reached, runs, substeps = [np.asarray(made.particles.x)], [], 1
     for case in cases:

@@ -116,8 +116,9 @@ def voting(scene: Scene, *, temperature: float | None = None) -> Voting:
     if inputs.views is None or inputs.views.masks is None:
         raise SceneError("input.views is missing: a study of segmentation needs posed photos with masks.")
     check_ids_occur(inputs.ids, inputs.views.masks)
-    masks, number = _compact(inputs.views.masks, inputs.ids.values())
-    views = eqx.tree_at(lambda v: v.masks, inputs.views, masks)
+    views = inputs.views.masked
+    masks, number = _compact(views.masks, inputs.ids.values())
+    views = eqx.tree_at(lambda v: v.masks, views, masks)
     train, held = views.training, views.held_out
     if held is not None and "train" in views.splits:
         shown, hidden = (train.cameras, train.masks), (held.cameras, held.masks)

@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 
 import pigjax
 from pigjax.cli import app, base, doctor
-from pigjax.core.errors import SceneError
+from pigjax.core.errors import InputError, SceneError
+from pigjax.io.compile_cache import SWITCH, cache_folder
 from pigjax.mpm.materials import PRESETS
 from pigjax.scene import load_scene
 from pigjax.scene.decode import merged, settings_from
@@ -152,3 +153,10 @@ def test_the_self_check_sees_a_wrong_step(monkeypatch):
     faults = []
     assert doctor._self_check(faults) == "failed"
     assert faults == ["self-check: a free fall of 0.1 ms gives [0. 0. 0.] m/s; please report it with this block."]
+
+
+def test_no_cache_keeps_no_compiled_programs(monkeypatch, tmp_path):
+    monkeypatch.setenv(SWITCH, str(tmp_path))
+    assert cache_folder() is not None
+    assert isinstance(said("run", str(tmp_path / "missing.toml"), "--no-cache").exception, InputError)
+    assert cache_folder() is None  # the option was read before the scene

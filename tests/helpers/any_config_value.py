@@ -12,6 +12,7 @@ from pigjax.core.errors import InputError
 from pigjax.mpm import Grid, SimConfig
 from pigjax.mpm.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
 from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.forces import ForceField, Impulse, Spring, Wind
 from pigjax.mpm.materials import Material
 from pigjax.mpm.sleep import Sleep
 from pigjax.reconstruction.train import FitConfig
@@ -36,6 +37,10 @@ MADE = [
     (Sphere, {"centre": ZERO, "radius": 1.0}),
     (Capsule, {"start": ZERO, "end": ONE, "radius": 1.0}),
     (Cylinder, {"start": ZERO, "end": ONE, "radius": 1.0}),
+    (Wind, {"velocity": ONE, "drag": 1.0}),
+    (ForceField, {"acceleration": ONE}),
+    (Impulse, {"momentum": ONE}),
+    (Spring, {"target": ZERO, "stiffness": 1.0}),
     (Grid, {"origin": ZERO, "dx": 1.0, "shape": (8, 8, 8)}),
     (Camera, {"world_to_cam": np.eye(4), "focal": np.ones(2), "centre": np.ones(2), "width": 4, "height": 4}),
     (SampledDistance, {"samples": np.zeros((2, 2, 2)), "origin": ZERO, "dx": 1.0}),

@@ -32,13 +32,14 @@ def perfect():
     return Worst(jnp.zeros(()))
 
 
-def begin(shared, state):
-    return jnp.sin(state["x"]) * shared["gain"]
+def begin(shared, state, number):
+    """What lies between depends on the number of the step, too."""
+    return jnp.sin(state["x"] + 0.1 * number) * shared["gain"]
 
 
-def wide_begin(shared, state):
+def wide_begin(shared, state, number):
     """What lies between is then larger than the state, and nothing of it is kept."""
-    return jnp.broadcast_to(begin(shared, state), (5, 2))
+    return jnp.broadcast_to(begin(shared, state, number), (5, 2))
 
 
 def end(shared, state, between, number):
@@ -61,7 +62,7 @@ def inputs():
 def plainly(length, shared, state, first):
     worst = Worst(jnp.zeros(()))
     for i in range(length):
-        state, own = end(shared, state, begin(shared, state), first + i)
+        state, own = end(shared, state, begin(shared, state, first + i), first + i)
         worst = worst.combine(own)
     return state, worst
 
@@ -117,9 +118,9 @@ def test_kept_states_are_not_recomputed(x64, keep, wide, recomputed):
     """Ten steps in blocks of 4, the first of 2: all, or of each block all but its beginning, and of the last none."""
     seen = []
 
-    def counted(shared, state):
+    def counted(shared, state, number):
         jax.debug.callback(lambda: seen.append("begin"))
-        return wide_begin(shared, state) if wide else begin(shared, state)
+        return wide_begin(shared, state, number) if wide else begin(shared, state, number)
 
     shared, state = inputs()
     own = steps(10, 4, keep)._replace(begin=counted)
@@ -157,8 +158,8 @@ def test_only_what_is_asked_for_is_differentiated(x64):
         return after["x"].sum()
 
     def written_out(x):
-        for _ in range(6):
-            x = stepped(x, begin(shared, {"x": x}))
+        for i in range(6):
+            x = stepped(x, begin(shared, {"x": x}, i))
         return x.sum()
 
     np.testing.assert_allclose(jax.grad(total)(state["x"]), jax.grad(written_out)(state["x"]), rtol=1e-12)

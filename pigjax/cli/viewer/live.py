@@ -10,11 +10,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 
 from pigjax.core.errors import InputError, SimulationError
-from pigjax.mpm import Health, Particles, vast_grid
+from pigjax.mpm import Health, vast_grid
 from pigjax.mpm.active_grid import ActiveGrid
+from pigjax.mpm.forces import Spring, grab
 from pigjax.mpm.materials import LAWS, Material, material_table
 from pigjax.mpm.materials.parameters import Parameters
 from pigjax.mpm.simulate import simulate
@@ -23,16 +23,7 @@ from pigjax.scene.plan import Plan
 
 _REACH = 2.5  # cells around the picked point that a drag takes hold of
 _MOST_FRAMES = 100_000
-_PULL = 12.0  # angular frequency of the spring of a drag [1/s], critically damped, at strength 1
-
-
-@dataclass(frozen=True)
-class Drag:
-    """A hand that holds matter by a spring."""
-
-    weights: Float[np.ndarray, "p"]  # of the particles that it holds, 1 at the picked one
-    target: Float[np.ndarray, "3"]  # where the hand is [m]
-    strength: float = 1.0
+_FREQUENCY = 2.0  # of a drag of strength 1 [Hz]
 
 
 @dataclass
@@ -72,7 +63,6 @@ class Live:
         self.plan, self.dx, self.objects = plan, dx, objects
         self.table = plan.table
         self.gravity = np.asarray(plan.gravity, float)
-        self.drag: Drag | None = None
         self.pace = Pace()
         self.restart()
 
@@ -84,7 +74,7 @@ class Live:
             lambda p: p.mass, self.particles, self.particles.volume0 * jnp.asarray(density, self.particles.x.dtype)
         )
         self.frame = 0
-        self.drag = None
+        self.hand = self._open_hand()
         # drawn deformation of matter whose present shape has become its rest shape: F = F_visual @ F_before
         self._before: Float[np.ndarray, "p 3 3"] | None = None
         self._active = ActiveGrid()
@@ -102,17 +92,17 @@ class Live:
             "frame_dt": self.plan.frame_dt,
             "gravity": self.gravity,
             "colliders": self.plan.colliders,
+            "forces": (*self.plan.forces, self.hand),
         }
         if self._rule is None:
             self._rule = substep_rule(
                 self.particles, domain, self.table, self.plan.config, frames=_MOST_FRAMES, **given
             )
-        start = self.particles if self.drag is None else pulled(self.particles, self.drag, self.plan.frame_dt)
         frames = simulate(
-            start,
+            self.particles,
             domain,
             self.table,
-            self._rule,
+            self._rule._replace(forces=given["forces"]),
             frames=range(self.frame, self.frame + 1),
             contact=self.plan.contact,
             active_grid=self._active,
@@ -132,27 +122,44 @@ class Live:
         now = np.asarray(self.particles.F_visual)
         return now if self._before is None else np.einsum("pij,pjk->pik", now, self._before)
 
-    def grab(self, particle: int, *, strength: float = 1.0) -> Float[np.ndarray, "3"]:
-        """Take hold of the matter around a particle; gives the place of the hand [m]."""
-        x = np.asarray(self.particles.x, np.float64)
-        place, body = x[particle], np.asarray(self.particles.body)
-        mine = np.flatnonzero((body == body[particle]) & np.isfinite(x).all(1))
-        near = mine[cKDTree(x[mine]).query_ball_point(place, _REACH * self.dx)]
-        weights = np.zeros(len(x))
-        squared = np.sum((x[near] - place) ** 2, 1) / (_REACH * self.dx) ** 2
-        weights[near] = np.maximum(1 - squared, 0) ** 2
-        weights[particle] = 1.0
-        self.drag = Drag(weights, place, strength)
-        return place
+    def grab(self, point: Any, *, strength: float = 1.0) -> Float[np.ndarray, "3"]:
+        """Take hold of the matter around a point [m]; gives the middle of what is held [m].
+
+        Args:
+            point: on or in the matter [m].
+            strength: 1, the default, follows a hand in half a second; stiffness grows in proportion.
+        """
+        frequency = _FREQUENCY * float(np.sqrt(strength))
+        self.hand = grab(self.particles, np.asarray(point, float), radius=_REACH * self.dx, frequency=frequency)
+        return np.asarray(self.hand.target, float)
 
     def move(self, target: Any) -> None:
-        """Move the hand [m]; nothing is held: no effect."""
-        if self.drag is not None:
-            self.drag = Drag(self.drag.weights, np.asarray(target, float), self.drag.strength)
+        """Move the hand [m]; where nothing is held it has no effect."""
+        kind = self.particles.x.dtype
+        self.hand = eqx.tree_at(lambda hand: hand.target, self.hand, jnp.asarray(target, kind))
 
     def release(self) -> None:
         """Let go."""
-        self.drag = None
+        self.hand = self._open_hand()
+
+    @property
+    def holds(self) -> bool:
+        """Whether matter is held."""
+        return bool(np.asarray(self.hand.stiffness) > 0)
+
+    @property
+    def held(self) -> Float[np.ndarray, "3"]:
+        """Middle of the held matter [m]."""
+        weights = np.asarray(self.hand.weights, float)[:, None]
+        return (weights * np.nan_to_num(np.asarray(self.particles.x, float))).sum(0) / max(weights.sum(), 1e-30)
+
+    def _open_hand(self) -> Spring:
+        """A spring that holds nothing. It is there from the start, so that a drag compiles nothing."""
+        kind = self.particles.x.dtype
+        zero = jnp.zeros((), kind)
+        return Spring(
+            target=jnp.zeros(3, kind), stiffness=zero, damping=zero, weights=jnp.zeros(len(self.particles), kind)
+        )
 
     def set_material(self, name: str, material: Material) -> None:
         """Make an object of other matter, and go on from where it is.
@@ -207,22 +214,3 @@ class Live:
     def moves(self, name: str) -> bool:
         """Whether an object is of matter that moves."""
         return name in self.objects and LAWS[self.table.laws[self.objects.index(name)]].respond is not None
-
-
-def pulled(particles: Particles, drag: Drag, duration: float) -> Particles:
-    """Particles with the velocity that a spring and damper give them in a time [s].
-
-    The middle X = Σ w x / Σ w of the held particles is drawn to the hand T as a critically damped oscillator of
-    frequency ω, by backward Euler, which is stable at any ω Δt: V' = (V + Δt ω² (T − X)) / (1 + 2 Δt ω + Δt² ω²). The
-    particles take the change of V by their weights, whatever their masses.
-    """
-    weights = jnp.asarray(drag.weights, particles.x.dtype)[:, None]
-    known = jnp.isfinite(particles.x).all(-1, keepdims=True)
-    weights = jnp.where(known, weights, 0.0)
-    x, v = (jnp.where(known, values, 0.0) for values in (particles.x, particles.v))
-    total = weights.sum()
-    middle, speed = ((weights * values).sum(0) / jnp.maximum(total, 1e-30) for values in (x, v))
-    omega = _PULL * float(np.sqrt(drag.strength))
-    target = jnp.asarray(drag.target, particles.x.dtype)
-    after = (speed + duration * omega**2 * (target - middle)) / (1 + 2 * duration * omega + (duration * omega) ** 2)
-    return eqx.tree_at(lambda p: p.v, particles, particles.v + weights * (after - speed))

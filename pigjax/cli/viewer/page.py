@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pigjax.cli.viewer.colouring import COLOURS
+from pigjax.cli.viewer.live import Live
 from pigjax.cli.viewer.posing import MODES
 from pigjax.cli.viewer.session import Session
 from pigjax.cli.viewer.solids import pose_of, shape_of
@@ -142,7 +143,7 @@ class Page:
         )
         away = away - np.dot(away, session.up) * session.up + 0.6 * session.up
         begin = self.server.initial_camera
-        begin.position = session.extent.centre + 2.4 * session.extent.radius * away / np.linalg.norm(away)
+        begin.position = session.extent.centre + 3.2 * session.extent.radius * away / np.linalg.norm(away)
         begin.look_at = session.extent.centre
         begin.up = session.up
         begin.near = float(session.extent.radius) / 200
@@ -211,7 +212,7 @@ class Page:
             gravity = np.asarray(self.gravity.value)
             show = self.arrow.value and np.any(gravity)
             self._draw("/gravity", gravity if show else None, self._add_arrow)
-            held = None if session.live is None or session.live.drag is None else session.live.drag
+            held = session.live if session.live is not None and session.live.holds else None
             self._draw("/hand", held, self._add_hand)
 
     def _push_particles(self) -> None:
@@ -261,8 +262,8 @@ class Page:
         if phase == "end":
             live.release()
         else:
-            if live.drag is None and index is not None:
-                live.grab(int(rows[index]), strength=self.strength.value)
+            if not live.holds and index is not None:
+                live.grab(np.asarray(live.particles.x)[int(rows[index])], strength=self.strength.value)
             live.move(place)
         if not self.playing:
             self._push_extras()
@@ -295,12 +296,8 @@ class Page:
         end = start + 0.5 * reach * gravity / np.linalg.norm(gravity)
         return self._arrow("/gravity", start, end, (200, 60, 60))
 
-    def _add_hand(self, drag: Any) -> Any:
-        live = self.session.live
-        assert live is not None
-        weights = drag.weights[:, None]
-        middle = (weights * np.nan_to_num(np.asarray(live.particles.x))).sum(0) / weights.sum()
-        return self._arrow("/hand", middle, drag.target, (40, 120, 220))
+    def _add_hand(self, live: Live) -> Any:
+        return self._arrow("/hand", live.held, np.asarray(live.hand.target, float), (40, 120, 220))
 
     def _arrow(self, name: str, start: np.ndarray, end: np.ndarray, colour: tuple[int, int, int]) -> Any:
         wide = 0.01 * self.session.extent.radius

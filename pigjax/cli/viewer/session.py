@@ -192,13 +192,6 @@ class Session:
         )
         return None if hit is None else (int(self.opened.object_id[hit.row]), hit)
 
-    def nearest_particle(self, point: Any) -> int | None:
-        """Particle nearest to a place [m]."""
-        if self._moment is None:
-            return None
-        away = np.nan_to_num(np.sum((self._moment.x - np.asarray(point)) ** 2, 1), nan=np.inf)
-        return int(np.argmin(away))
-
     # what the controls do
 
     def change_look(self, **changes: Any) -> None:

@@ -136,6 +136,9 @@ class MaterialTable(Parameters):
 def material_table(materials: Sequence[Material]) -> MaterialTable:
     """Table with one row for each material, in their order.
 
+    Args:
+        materials: one or more; their laws are static, their numbers arrays.
+
     Raises:
         InputError: there is none, or a number of one is an array.
     """

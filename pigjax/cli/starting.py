@@ -1,0 +1,76 @@
+"""The command `new`: a first scene file for one's own photos or splats."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pigjax.cli.base import Overwrite, app, console, one_device_per_core, output_path, said
+from pigjax.core.errors import InputError
+
+_UP = "Axis that points up: x, y, z, -x, -y, -z; from the cameras or the ground if not given."
+
+
+@app.command()
+def new(
+    source: Annotated[Path, typer.Argument(help="Trained .ply, .splat, .spz; posed photos, or the folder of all.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder for the scene; scene-NAME if not given.",
+            parser=str,
+            callback=lambda path: None if path is None else output_path(path),
+            metavar="PATH",
+        ),
+    ] = None,
+    gaussians: Annotated[Path | None, typer.Option(help="Trained splats, if they lie elsewhere.")] = None,
+    masks: Annotated[Path | None, typer.Option(help="Instance masks, if they lie elsewhere.")] = None,
+    names: Annotated[Path | None, typer.Option(help="JSON of mask ids and names, if it lies elsewhere.")] = None,
+    up: Annotated[str | None, typer.Option(help=_UP)] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a scene file to edit: up, ground, objects with pictures and materials; say what is missing."""
+    one_device_per_core()
+    from pigjax import io
+    from pigjax.cli.drafting import missing_gaussians, missing_masks, missing_poses, write_draft
+    from pigjax.io.finding import find_parts
+
+    found = find_parts(source)
+    given = {"gaussians": gaussians, "masks": masks, "names": names}
+    found = found._replace(**{key: path for key, path in given.items() if path is not None})
+    if found.views is None and found.gaussians is None:
+        for line in missing_poses(source, found.photos):
+            console.print(said(line))
+        raise InputError(f"{source}: holds neither posed photos nor trained splats; {found.problem}")
+    if found.gaussians is None:
+        for line in (*missing_gaussians(source), *(missing_masks(source) if found.masks is None else ())):
+            console.print(said(line))
+        raise InputError(f"{source}: holds no trained splats; reconstruct them, or name the file by --gaussians.")
+    stem = source.resolve().stem if source.is_file() else source.resolve().name
+    folder = io.output_folder(
+        Path(f"scene-{io.safe_name(stem)}") if out is None else out,
+        files=("scene.toml", "labels.npz"), folders=("thumbnails",),
+    )  # fmt: skip
+    if (folder / "scene.toml").exists() and not overwrite:
+        raise InputError(f"{folder / 'scene.toml'}: exists; give --overwrite to replace it, or another -o.")
+    draft = write_draft(found, folder, up=up, ask=_ask if sys.stdin.isatty() and up is None else None)
+    for remark in draft.remarks:
+        console.print(said(remark, label="note: ", style="yellow"))
+    for part in draft.parts:
+        kind = "fixed" if part.fixed else "jelly, to be changed"
+        console.print(said(f"{part.name}: {int(part.members.sum())} splats, {kind}"))
+    if found.masks is None and found.views is not None:
+        for line in missing_masks(source):
+            console.print(said(line))
+    console.print(said(f"written to {folder / 'scene.toml'}; look at {folder / 'thumbnails'}, edit it, then:"))
+    console.print(said(f"pigjax run {folder / 'scene.toml'} -o {folder / 'out'}"))
+
+
+def _ask(guess: str) -> str:
+    """The axis that points up, from who sits at the terminal."""
+    return typer.prompt("Which axis points up (x, y, z, -x, -y, -z)?", default=guess, err=True)

@@ -1,0 +1,439 @@
+"""A first scene file for files that have none: up, ground, objects and their materials, as a text to edit. Host.
+
+Objects come from masks where there are any, else from the connected parts above the ground. All that is guessed is
+said in a comment beside it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pigjax import io
+from pigjax.core.camera import Camera, orbit
+from pigjax.core.errors import InputError
+from pigjax.coupling.solid import large_parts, parts_of
+from pigjax.mpm.materials import PRESETS
+from pigjax.objects.lifting import lift
+from pigjax.segmentation import Labels
+from pigjax.splat import Gaussians, RenderConfig, render
+from pigjax.splatting.types import extent_of
+
+AXES = ("x", "y", "z", "-x", "-y", "-z")
+THUMBNAIL = 192  # px
+_BINS = 60  # of the heights in which a ground is looked for
+_LEAST_GROUND = 0.12  # share of the splats in a layer that counts as a ground
+_WIDER = 1.3  # times the area of what is above it that a ground has
+_FEWEST = 50  # Gaussians of a part that is offered as an object
+_MOST_PARTS = 16
+_SUPPORTS = ("table", "desk", "floor", "ground", "shelf", "plinth", "pot", "wall", "bench", "board")
+_CELLS = 16  # of the grid along the smallest moving object
+
+
+@dataclass
+class Part:
+    """An object of the draft."""
+
+    name: str
+    id: int
+    members: Bool[np.ndarray, "n"]
+    low: Float[np.ndarray, "3"]  # corners of its box, without strays [m]
+    high: Float[np.ndarray, "3"]
+    fixed: bool = False
+    is_known: bool = False  # whether the file of names has it, so that it needs no id
+
+    @property
+    def size(self) -> float:
+        """Cube root of the volume of its box [m]; a side counts as at least a twentieth of the longest."""
+        sides = self.high - self.low
+        return float(np.prod(np.maximum(sides, 0.05 * sides.max())) ** (1 / 3))
+
+
+@dataclass
+class Draft:
+    """A scene file, and what belongs beside it."""
+
+    text: str  # of scene.toml
+    parts: list[Part]
+    labels: Labels | None  # for labels.npz; None: masks or a single object tell
+    up: str
+    remarks: list[str] = field(default_factory=list)  # guesses and gaps, each with its remedy
+
+
+def draft_scene(
+    gaussians_path: Path,
+    folder: Path,
+    *,
+    views_path: Path | None = None,
+    masks_path: Path | None = None,
+    names_path: Path | None = None,
+    up: str | None = None,
+) -> tuple[Draft, Gaussians, io.Views | None]:
+    """Draft a scene for Gaussians, with posed photos and masks where there are any.
+
+    Args:
+        gaussians_path: trained splats.
+        folder: where scene.toml will lie; its paths are relative to it.
+        views_path: posed photos.
+        masks_path: instance masks of the photos.
+        names_path: JSON of mask ids and names.
+        up: axis that points up (x, y, z, -x, -y, -z); None: from the cameras, else from the ground.
+
+    Returns:
+        The draft, and the Gaussians and views that it was made from.
+
+    Raises:
+        InputError: a file is damaged, the axis is unknown, or no part of the scene is large enough for an object.
+    """
+    if up is not None and up not in AXES:
+        raise InputError(f"up = {up!r}: choose one of {', '.join(AXES)}.")
+    gaussians = io.load_gaussians(gaussians_path, drop_invalid=True)
+    names = {} if names_path is None else io.load_names(names_path)
+    views = None
+    if views_path is not None:
+        masks = {} if masks_path is None else {"masks": masks_path, "missing_masks": "abstain"}
+        views = io.load_views(views_path, **masks)
+    core = extent_of(gaussians).core
+    means = np.asarray(gaussians.means, np.float64)
+    remarks: list[str] = []
+    if up is None:
+        up, told = up_of_cameras(views.cameras) if views is not None else up_of_ground(means[core])
+        remarks.append(told)
+    axis = _axis(up)
+    ground = ground_height(means[core], axis)
+    if views is not None and views.masks is not None:
+        parts, labels, ground = _masked_parts(gaussians, views, names), None, None
+        height = min(_lowest(part, axis) for part in parts)
+    else:
+        parts, labels = _connected_parts(gaussians, core, axis, ground)
+        height = min(_lowest(part, axis) for part in parts) if ground is None else ground
+        remarks.append(
+            "no masks: objects are the connected parts above the ground; for other ones give"
+            " objects.<name>.within = { lower = [x, y, z], upper = [x, y, z] }, or masks of posed photos."
+        )
+    _mark_supports(parts, axis)
+    text = _text(
+        _Sources(gaussians_path, views_path, masks_path, names_path, folder),
+        parts, labels is not None, up, height, ground is not None, extent_of(gaussians).radius, remarks,
+    )  # fmt: skip
+    return Draft(text, parts, labels, up, remarks), gaussians, views
+
+
+def up_of_cameras(cameras: Camera) -> tuple[str, str]:
+    """The axis nearest to the mean of what cameras have above them, and a sentence that tells it."""
+    above = -np.asarray(cameras.world_to_cam, np.float64)[..., 1, :3].reshape(-1, 3).mean(0)
+    length = float(np.linalg.norm(above))
+    k = int(np.argmax(np.abs(above)))
+    name = ("" if above[k] > 0 else "-") + "xyz"[k]
+    angle = np.degrees(np.arccos(np.clip(np.abs(above[k]) / max(length, 1e-12), 0, 1)))
+    told = f"up = {name}: the cameras' own up, on average, is {angle:.0f} degrees from it"
+    far = "; the scene is tilted, check it" if angle > 20 or length < 0.3 else ""
+    return name, f"{told}{far}."
+
+
+def up_of_ground(means: Float[np.ndarray, "n 3"]) -> tuple[str, str]:
+    """The axis along which the lower end of a cloud is most like a ground, and a sentence that tells it."""
+    shares = {name: _ground_layer(means @ _axis(name))[0] for name in AXES}
+    best, second = sorted(shares, key=lambda name: shares[name], reverse=True)[:2]
+    if shares[best] < _LEAST_GROUND or shares[best] < 1.3 * shares[second]:
+        return "z", "up = z: a guess, since no ground is seen in the splats; give --up if it is another axis."
+    return best, f"up = {best}: {100 * shares[best]:.0f} % of the splats lie in one layer at that axis' lower end."
+
+
+def ground_height(means: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, "3"]) -> float | None:
+    """Height of the ground [m] along an axis that points up; None where there is none.
+
+    It is a layer at the lower end that holds an eighth of the splats and spreads wider than what is above it: not the
+    flat bottom of an object.
+    """
+    heights = means @ axis
+    share, height, top = _ground_layer(heights)
+    if share < _LEAST_GROUND:
+        return None
+    across = means[:, np.abs(axis) < 0.5]
+    layer, above = ((heights <= top) & (heights >= height - (top - height)), heights > top)
+    areas = [float(np.prod(np.subtract(*np.quantile(across[k], [0.95, 0.05], axis=0)))) for k in (layer, above)]
+    return height if areas[0] > _WIDER * areas[1] else None
+
+
+def thumbnails(
+    gaussians: Gaussians, parts: list[Part], views: io.Views | None, up: str
+) -> dict[str, Float[np.ndarray, "h w 3"]]:
+    """A picture of each object alone: from the view that shows it largest, else from an orbit around it.
+
+    One program draws all: the other Gaussians are there, and transparent.
+    """
+    hidden = jnp.full_like(gaussians.logit_opacities, -40.0)
+    config = RenderConfig(bands=1)
+
+    @jax.jit
+    def draw(gaussians: Gaussians, opacities: jax.Array, camera: Camera) -> jax.Array:
+        alone = Gaussians(gaussians.means, gaussians.log_scales, gaussians.quats, opacities, gaussians.sh)
+        frame = render(alone, camera, config, background=1.0, outputs=("rgb",))
+        return jnp.clip(frame.rgb, 0, 1)
+
+    pictures = {}
+    for part in parts:
+        opacities = jnp.where(jnp.asarray(part.members), gaussians.logit_opacities, hidden)
+        pictures[part.name] = np.asarray(draw(gaussians, opacities, _camera_of(part, views, up)))
+    return pictures
+
+
+def _axis(up: str) -> Float[np.ndarray, "3"]:
+    return np.eye(3)["xyz".index(up[-1])] * (-1 if up.startswith("-") else 1)
+
+
+def _lowest(part: Part, axis: Float[np.ndarray, "3"]) -> float:
+    """Height of its foot [m]."""
+    return float(min(part.low @ axis, part.high @ axis))
+
+
+def _highest(part: Part, axis: Float[np.ndarray, "3"]) -> float:
+    return float(max(part.low @ axis, part.high @ axis))
+
+
+def _ground_layer(heights: Float[np.ndarray, "n"]) -> tuple[float, float, float]:
+    """Share of the splats in the fullest layer of the lower third, 0 where little is above; its height and end [m]."""
+    low, high = np.quantile(heights, [0.005, 0.995])
+    if not high > low:
+        return 0.0, float(low), float(low)
+    counts, edges = np.histogram(heights, _BINS, (low, high))
+    layers = counts[:-1] + counts[1:]
+    k = int(np.argmax(layers[: _BINS // 3]))
+    inside = heights[(heights >= edges[k]) & (heights <= edges[k + 2])]
+    above = float((heights > edges[k + 2]).mean())
+    share = float(len(inside) / len(heights)) if above > 0.1 else 0.0
+    return share, float(np.median(inside)), float(edges[k + 2])
+
+
+def _masked_parts(gaussians: Gaussians, views: io.Views, names: dict[int, str]) -> list[Part]:
+    voters = views.training
+    assert voters.masks is not None
+    labels = lift(gaussians, voters.cameras, voters.masks)
+    object_id = np.asarray(labels.object_id)
+    means = np.asarray(gaussians.means, np.float64)
+    found = [int(number) for number in np.unique(object_id) if number > 0]
+    parts = [_part(_free(names, k), k, object_id == k, means) for k in found]
+    for part in parts:
+        part.is_known = names.get(part.id) == part.name
+    if not parts:
+        raise InputError("the masks give no Gaussian an object; check that masks and photos belong together.")
+    return parts
+
+
+def _connected_parts(
+    gaussians: Gaussians, core: Bool[np.ndarray, "n"], axis: Float[np.ndarray, "3"], ground: float | None
+) -> tuple[list[Part], Labels | None]:
+    """Parts above the ground, the largest first, and the labels that say so; a single one without a ground has none."""
+    means = np.asarray(gaussians.means, np.float64)
+    heights = np.where(core, means @ axis, -np.inf)
+    free = core.copy()
+    if ground is not None:
+        layer = np.abs(heights[core] - ground)
+        free &= heights > ground + 3 * float(np.median(layer[layer <= np.quantile(layer, 0.3)])) + 1e-9
+    index = np.flatnonzero(free)
+    radii = np.exp(np.clip(np.asarray(gaussians.log_scales, np.float64)[index], -60, 60)).max(1)
+    component, _ = parts_of(means[index], radii)
+    sizes = np.bincount(component)
+    kept = [int(k) for k in np.argsort(-sizes) if large_parts(sizes, len(index))[k] and sizes[k] >= _FEWEST]
+    if not kept:
+        raise InputError(f"no connected part has {_FEWEST} Gaussians or more; give masks, or a finer reconstruction.")
+    object_id: Int[np.ndarray, "n"] = np.zeros(len(means), np.int32)
+    for number, k in enumerate(kept[:_MOST_PARTS], 1):
+        object_id[index[component == k]] = number
+    if ground is None and len(kept) == 1:
+        object_id[:] = 1
+    count = min(len(kept), _MOST_PARTS)
+    parts = [_part(f"part_{k}", k, (object_id == k) & core, means) for k in range(1, count + 1)]
+    if ground is None and count == 1:
+        return parts, None
+    votes = np.zeros((len(means), count + 1), np.int32)
+    votes[np.arange(len(means)), object_id] = 1
+    return parts, Labels(jnp.asarray(object_id), jnp.asarray(votes), jnp.ones(len(means)))
+
+
+def _part(name: str, number: int, members: Bool[np.ndarray, "n"], means: Float[np.ndarray, "n 3"]) -> Part:
+    low, high = np.quantile(means[members], [0.01, 0.99], axis=0)
+    return Part(name, number, members, low, high)
+
+
+def _free(names: dict[int, str], number: int) -> str:
+    """The name of an id, where it is one line, no dots part it, and no other id has it."""
+    name = names.get(number, "")
+    fit = name.isprintable() and name.strip() and "." not in name and list(names.values()).count(name) == 1
+    return name if fit else f"object_{number}"
+
+
+def _mark_supports(parts: list[Part], axis: Float[np.ndarray, "3"]) -> None:
+    """What carries the others is fixed: by its name, or since the feet of most others stand over its top."""
+    across = np.abs(axis) < 0.5
+    for part in parts:
+        others = [other for other in parts if other is not part]
+        over = 0
+        for other in others:
+            middle = ((other.low + other.high) / 2)[across]
+            inside = bool(((middle >= part.low[across]) & (middle <= part.high[across])).all())
+            foot, tall = _lowest(other, axis), _highest(other, axis) - _lowest(other, axis)
+            over += inside and abs(foot - _highest(part, axis)) < max(0.5 * tall, 1e-9) and foot > _lowest(part, axis)
+        named = re.sub(r"[\W_0-9]+", " ", part.name.lower()).split()
+        carries = len(others) > 1 and 2 * over >= len(others)
+        part.fixed = carries or (bool(others) and any(word in _SUPPORTS for word in named))
+    if all(part.fixed for part in parts):
+        max(parts, key=lambda part: _highest(part, axis)).fixed = False
+
+
+def _camera_of(part: Part, views: io.Views | None, up: str) -> Camera:
+    """A square camera that the object fills."""
+    middle, radius = (part.low + part.high) / 2, max(float(np.linalg.norm(part.high - part.low)) / 2, 1e-6)
+    axis, distance = _axis(up), 2.6 * radius
+    start, elevation = 0.0, np.radians(25)
+    if views is not None:
+        places = np.asarray(views.cameras.position, np.float64).reshape(-1, 3)
+        offset = places[int(np.argmin(np.linalg.norm(places - middle, axis=1)))] - middle
+        along = float(np.clip(offset @ axis / max(np.linalg.norm(offset), 1e-12), -0.95, 0.95))
+        elevation = float(np.arcsin(along))
+        first = np.eye(3)[0] if abs(axis[0]) < 0.9 else np.eye(3)[2]
+        first = first - axis * (first @ axis)
+        start = float(np.arctan2(offset @ np.cross(axis, first), offset @ first))
+    return orbit(
+        middle, radius=distance, elevation=elevation, frames=1, focal=1.15 * THUMBNAIL,
+        width=THUMBNAIL, height=THUMBNAIL, start=start, up=axis,
+    )[0]  # fmt: skip
+
+
+@dataclass
+class _Sources:
+    gaussians: Path
+    views: Path | None
+    masks: Path | None
+    names: Path | None
+    folder: Path
+
+    def lines(self, labelled: bool) -> list[str]:
+        """The table `input`, without its axis."""
+        entries = {"gaussians": self.gaussians, "views": self.views, "masks": self.masks, "names": self.names}
+        if labelled:
+            entries |= {"masks": None, "names": None}
+        lines = [f"{key} = {_quoted(self._relative(path))}" for key, path in entries.items() if path is not None]
+        return [*lines, *(['labels = "labels.npz" # which object each Gaussian belongs to'] if labelled else [])]
+
+    def _relative(self, path: Path) -> str:
+        try:
+            return Path(os.path.relpath(path, self.folder)).as_posix()
+        except ValueError:  # another drive
+            return str(path)
+
+
+def _text(
+    sources: _Sources,
+    parts: list[Part],
+    labelled: bool,
+    up: str,
+    height: float,
+    is_ground: bool,
+    radius: float,
+    remarks: list[str],
+) -> str:
+    axis = _axis(up)
+    moving = [part for part in parts if not part.fixed]
+    dx = _rounded(min(part.size for part in moving) / _CELLS)
+    tall = max(_highest(part, axis) - _lowest(part, axis) for part in moving)
+    point = ", ".join(f"{value + 0.0:.4g}" for value in axis * height)
+    normal = ", ".join(f"{value + 0.0:g}" for value in axis)
+    tallest = max(moving, key=lambda part: _highest(part, axis) - _lowest(part, axis))
+    held = _lowest(tallest, axis) + 0.15 * tall
+    foot = ", ".join(f"{value + 0.0:.4g}" for value in axis * held)
+    lines = [
+        "# Written by `pigjax new` to be edited; lines behind # are choices. Run it: pigjax run scene.toml -o out",
+        *(f"# {remark}" for remark in remarks),
+        "",
+        "[input]",
+        *sources.lines(labelled),
+        f"up = {_quoted(up)} # axis of the scene that points up: x, y, z, -x, -y or -z",
+        "",
+        "# Lengths are in the units of the splats, read as metres. Cameras of COLMAP have no scale: the tallest moving",
+        f"# object is {tall:.3g} units tall here. If that is not its height in metres, it weighs too much or too",
+        "# little for its stiffness: multiply young (and yield_stress, cohesion) by units per metre.",
+        "[simulation]",
+        f"dx = {dx:g} # grid spacing [m]: a sixteenth of the smallest moving object; smaller is finer and slower",
+        "frames = 48",
+        "fps = 24 # frames a second of the video",
+        "gravity = 9.81 # m/s², against up",
+        "slow_motion = 1 # 4 shows the motion four times slower",
+        '# integrator = "auto" # implicit steps where matter is so stiff that explicit ones would be many',
+        "# contact_friction = 0.5 # objects never stick to each other, and slide with this friction",
+        "",
+    ]
+    for part in parts:
+        lines += _object_lines(part, needs_id=labelled or (sources.views is not None and not part.is_known))
+    lines += [
+        f"[planes.ground] # {'the layer of splats at the lower end' if is_ground else 'below all objects'}",
+        f"point = [{point}] # m",
+        f"normal = [{normal}]",
+        "friction = 0.5 # Coulomb's coefficient",
+        "",
+        "# [pinned.foot] # matter behind this plane does not move, as a plant in its pot",
+        f"# point = [{foot}] # m",
+        f"# normal = [{normal}]",
+        "",
+        "# [forces.breeze] # beside gravity: kind = wind, field, impulse or spring",
+        '# kind = "wind"',
+        "# velocity = [2, 0, 0] # m/s",
+        "# drag = 2 # 1/s: still matter has the wind's speed after about 1/drag",
+        "# gusts = 1 # m/s",
+        "",
+        "[camera] # of the video; without any field here: the training view that shows the moving objects best, else",
+        "# an orbit around them",
+        '# view = "name of a photo"',
+        f"# radius = {3 * radius:.3g} # m: distance of an orbit",
+        "# elevation = 20 # degrees above the horizon",
+        "# sweep = 60 # degrees around in the whole video",
+        "width = 640",
+        "height = 480",
+        "background = 1.0 # grey level: 0 black, 1 white",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _object_lines(part: Part, *, needs_id: bool) -> list[str]:
+    size = " x ".join(f"{side:.3g}" for side in part.high - part.low)
+    picture = io.safe_name(part.name)
+    lines = [
+        f"[objects.{_key(part.name)}] # {int(part.members.sum())} splats, {size} m; see thumbnails/{picture}.png",
+        *([f"id = {part.id}"] if needs_id else []),
+    ]
+    if part.fixed:
+        return [*lines, "fixed = true # carries the others: a collider made from its splats", "friction = 0.5", ""]
+    others = ", ".join(name for name in PRESETS if name != "jelly")
+    return [
+        *lines,
+        f'material = "jelly" # or {others}',
+        "# density = 1000 # kg/m³",
+        "# young = 1e5 # Pa: lower is softer",
+        "# velocity = [0, 0, 0] # m/s, at the start",
+        "# fixed = true # instead of a material: a collider made from its splats",
+        "",
+    ]
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _quoted(name)
+
+
+def _quoted(text: str) -> str:
+    """A basic string of TOML."""
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _rounded(value: float) -> float:
+    """With two digits."""
+    return float(f"{value:.2g}")

@@ -1,0 +1,161 @@
+"""`pigjax new`: what it guesses, what it says is missing, and that the scene that it writes loads, plans and runs."""
+
+import warnings
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from pigjax import io
+from pigjax.cli import app
+from pigjax.core.errors import InputError, MissingFileError
+from pigjax.io.finding import find_parts
+from pigjax.scene import load_scene, run_scene
+from pigjax.scene.draft import Part, _mark_supports, ground_height, up_of_cameras, up_of_ground
+from pigjax.scene.plan import make_plan, read_inputs, segment
+from pigjax.splat import Gaussians
+
+TABLETOP = Path(__file__).parents[2] / "examples" / "tabletop"
+
+
+def sphere(middle, radius, count, rng):
+    direction = rng.normal(size=(count, 3))
+    return middle + radius * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+
+
+def splats(points):
+    count = len(points)
+    parts = points, np.full((count, 3), np.log(0.012)), np.tile([1.0, 0, 0, 0], (count, 1)), np.full(count, 3.0)
+    return Gaussians(*(jnp.asarray(v, jnp.float32) for v in (*parts, np.zeros((count, 1, 3)))))
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    """Two balls over a ground at y = -0.1, whose -y is up, and haze."""
+    rng = np.random.default_rng(0)
+    ground = np.stack([rng.uniform(-1, 1, 3000), np.full(3000, -0.1), rng.uniform(-1, 1, 3000)], 1)
+    points = [ground, sphere([0.4, 0.25, 0], 0.2, 900, rng), sphere([-0.4, 0.15, 0.1], 0.12, 500, rng)]
+    points = np.concatenate([*points, rng.uniform(-3, 3, (40, 3))])
+    return points * [1, -1, 1]
+
+
+def new(*words):
+    return CliRunner().invoke(app, ["new", *map(str, words)], catch_exceptions=True)
+
+
+def test_up_and_ground_of_a_cloud(cloud):
+    up, told = up_of_ground(cloud)
+    assert up == "-y"
+    assert "in one layer" in told
+    assert ground_height(cloud, np.array([0.0, -1.0, 0.0])) == pytest.approx(-0.1, abs=0.02)
+    ball = sphere(np.zeros(3), 1.0, 4000, np.random.default_rng(1))
+    assert up_of_ground(ball)[0] == "z"
+    assert "a guess" in up_of_ground(ball)[1]
+    assert ground_height(ball, np.array([0.0, 0.0, 1.0])) is None
+    mushroom = np.concatenate([0.5 * sphere(np.zeros(3), 1.0, 3000, np.random.default_rng(2)) * [1, 1, 0.01], ball])
+    assert up_of_ground(mushroom + np.where(np.arange(7000) < 3000, -2, 0)[:, None] * [0, 0, 1])[0] == "z"
+    assert ground_height(mushroom + np.where(np.arange(7000) < 3000, -2, 0)[:, None] * [0, 0, 1], np.eye(3)[2]) is None
+
+
+def test_up_of_cameras_is_their_own():
+    cameras = io.load_cameras(TABLETOP)[0]
+    assert up_of_cameras(cameras)[0] == "z"
+
+
+def test_what_carries_the_others_is_fixed():
+    def part(name, low, high):
+        return Part(name, 1, np.ones(1, bool), np.array(low, float), np.array(high, float))
+
+    slab = part("thing", [-1, -1, -0.1], [1, 1, 0])
+    cups = [part(f"cup_{k}", [k / 2 - 0.1, 0, 0.0], [k / 2 + 0.1, 0.2, 0.3]) for k in (-1, 0, 1)]
+    _mark_supports([slab, *cups], np.array([0.0, 0.0, 1.0]))
+    assert slab.fixed
+    assert not any(cup.fixed for cup in cups)
+    plant, pot = part("leaves", [0, 0, 1], [1, 1, 2]), part("flower_pot", [0, 0, 0], [1, 1, 1])
+    _mark_supports([plant, pot], np.array([0.0, 0.0, 1.0]))
+    assert (plant.fixed, pot.fixed) == (False, True)
+    alone = part("table", [0, 0, 0], [1, 1, 1])
+    _mark_supports([alone], np.array([0.0, 0.0, 1.0]))
+    assert not alone.fixed
+
+
+def test_a_bare_file_becomes_a_scene_that_plans(cloud, tmp_path):
+    io.save_ply(tmp_path / "my things.ply", splats(cloud))
+    told = new(tmp_path / "my things.ply", "-o", tmp_path / "scene")
+    assert told.exit_code == 0, told.output
+    scene = load_scene(tmp_path / "scene" / "scene.toml")
+    assert scene.input.up == "-y"
+    assert sorted(scene.objects) == ["part_1", "part_2"]
+    np.testing.assert_allclose(scene.planes["ground"].point, [0, 0.1, 0], atol=0.02)
+    inputs = read_inputs(scene)
+    labels = segment(scene, inputs)
+    found = np.asarray(labels.object_id)
+    assert (np.bincount(found)[1:] == [900, 500]).all()
+    plan = make_plan(scene, inputs, labels)
+    assert set(np.asarray(plan.particles.body)) == {0, 1}
+    assert np.isfinite(np.asarray(plan.particles.x)).all()
+    thumbnail = np.asarray(Image.open(tmp_path / "scene" / "thumbnails" / "part_1.png").convert("L"))
+    assert 0.1 < (thumbnail < 250).mean() < 0.8
+    again = new(tmp_path / "my things.ply", "-o", tmp_path / "scene")
+    assert isinstance(again.exception, InputError)
+    assert "exists; give --overwrite" in str(again.exception)
+
+
+def test_a_single_thing_is_one_object(tmp_path):
+    io.save_ply(tmp_path / "ball.ply", splats(sphere(np.zeros(3), 0.3, 600, np.random.default_rng(2))))
+    assert new(tmp_path / "ball.ply", "-o", tmp_path / "scene", "--up", "y").exit_code == 0
+    scene = load_scene(tmp_path / "scene" / "scene.toml")
+    assert (list(scene.objects), scene.input.labels, scene.input.up) == (["part_1"], None, "y")
+    assert scene.planes["ground"].point[1] == pytest.approx(-0.3, abs=0.02)
+
+
+def test_what_is_missing_is_said_with_commands(tmp_path):
+    photos = tmp_path / "capture" / "images"
+    photos.mkdir(parents=True)
+    for k in range(3):
+        Image.new("RGB", (8, 8)).save(photos / f"{k}.png")
+    told = new(tmp_path / "capture")
+    assert isinstance(told.exception, InputError)
+    assert "holds neither posed photos nor trained splats" in str(told.exception)
+    assert "3 photos without camera poses" in told.output
+    assert "colmap automatic_reconstructor" in told.output
+
+    posed = tmp_path / "posed"
+    posed.mkdir()
+    for name in ("transforms.json", "images"):
+        (posed / name).symlink_to(TABLETOP / name)
+    told = new(posed)
+    assert "holds no trained splats" in str(told.exception)
+    assert f"pigjax reconstruct '{posed}'" in told.output
+    assert "vos_inference.py" in told.output
+    with pytest.raises(MissingFileError):
+        find_parts(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="up = 'up'"):
+        raise new(TABLETOP, "--up", "up", "-o", tmp_path / "scene").exception
+
+
+def test_the_parts_of_a_capture_are_found():
+    found = find_parts(TABLETOP)
+    assert found.gaussians == TABLETOP / "tabletop.ply"  # and not the points of structure from motion
+    assert (found.views, found.masks, found.names) == (TABLETOP, TABLETOP / "object_mask", TABLETOP / "names.json")
+    assert find_parts(TABLETOP / "transforms.json")[:1] == found[:1]
+
+
+@pytest.mark.slow
+def test_the_tabletop_becomes_a_scene_that_runs(tmp_path):
+    told = new(TABLETOP, "-o", tmp_path / "scene")
+    assert told.exit_code == 0, told.output
+    path = tmp_path / "scene" / "scene.toml"
+    text = path.read_text()
+    path.write_text(text.replace("frames = 48", "frames = 4").replace("640", "96").replace("480", "72"))
+    scene = load_scene(path, accuracy="draft")
+    assert [name for name, entry in scene.objects.items() if entry.fixed] == ["table"]
+    assert len(scene.objects) == 7
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        report = run_scene(scene, tmp_path / "out")
+    assert report.health["first_bad_frame"] is None
+    assert (tmp_path / "out" / "video.mp4").exists()
