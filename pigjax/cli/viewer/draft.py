@@ -88,7 +88,7 @@ class Draft:
         kept: dict[str, Any] = {key: table[key] for key in ("id", "velocity") if key in table}
         self.objects[name] = {**kept, "material": preset}
 
-    def set_number(self, name: str, field: str, value: float) -> None:
+    def set_number(self, name: str, field: str, value: float | int) -> None:
         """Change one number of an object's material, such as its Young's modulus.
 
         Raises:
@@ -96,7 +96,7 @@ class Draft:
         """
         self._try(("objects", name, field), round_number(value))
 
-    def set_velocity(self, name: str, velocity: Sequence[float]) -> None:
+    def set_velocity(self, name: str, velocity: Sequence[float | int]) -> None:
         """Initial velocity of an object [m/s].
 
         Raises:
@@ -104,7 +104,7 @@ class Draft:
         """
         self._try(("objects", name, "velocity"), [round_number(value) for value in velocity])
 
-    def set_gravity(self, gravity: Sequence[float]) -> None:
+    def set_gravity(self, gravity: Sequence[float | int]) -> None:
         """Gravity as a vector [m/s²].
 
         Raises:
@@ -112,7 +112,7 @@ class Draft:
         """
         self._try(("simulation", "gravity"), [round_number(value) for value in gravity])
 
-    def set_ground(self, point: Sequence[float] | None, normal: Sequence[float] = (0.0, 0.0, 1.0)) -> None:
+    def set_ground(self, point: Sequence[float | int] | None, normal: Sequence[float | int] = (0.0, 0.0, 1.0)) -> None:
         """Put a plane under the scene, or take it away.
 
         Args:
@@ -172,6 +172,6 @@ class Draft:
             raise SceneError(f"objects.{name}: is there already; choose another name.")
 
 
-def round_number(value: float) -> float:
+def round_number(value: float | int) -> float:
     """A number of a page without the noise of its last digits."""
     return float(f"{float(value):.{_ROUND}g}")
