@@ -12,15 +12,15 @@ from pigjax.cli.base import answers, app, console, row, said
 
 def _tell_version(wanted: bool) -> bool:
     if wanted:
-        from pigjax import __version__
+        import pigjax
 
-        answers.print(said(f"pigjax {__version__}"))
+        answers.print(said(f"pigjax {pigjax.__version__}"))
         raise typer.Exit
     return wanted
 
 
 @app.callback()
-def pigjax(
+def every_command(
     version: Annotated[
         bool, typer.Option("--version", help="Print the version.", callback=_tell_version, is_eager=True)
     ] = False,

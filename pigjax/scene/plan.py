@@ -163,8 +163,14 @@ def _warn_of_unnamed(inputs: Inputs, found: Int[np.ndarray, "k"]) -> None:
         )
 
 
-def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
+def make_plan(scene: Scene, inputs: Inputs, labels: Labels, *, gaussians_per_cell: int | None = None) -> Plan:
     """Particles, colliders and settings.
+
+    Args:
+        scene: as it was read.
+        inputs: its files.
+        labels: objects of the Gaussians.
+        gaussians_per_cell: most Gaussians that become particles in a lattice cell, as of `seed_particles`.
 
     Raises:
         SceneError: something of the scene cannot be simulated, named by its field.
@@ -183,6 +189,7 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         spacing=spec.dx,
         velocities={inputs.ids[name]: entry.velocity for name, entry in moving.items()},
         particles_per_cell=spec.particles_per_cell,
+        gaussians_per_cell=gaussians_per_cell,
         colliders=colliders,
         seed=spec.seed,
     )

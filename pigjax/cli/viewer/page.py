@@ -10,19 +10,16 @@ from typing import Any
 import numpy as np
 
 from pigjax.cli.viewer.colouring import COLOURS
-from pigjax.cli.viewer.live import Live
 from pigjax.cli.viewer.posing import MODES
 from pigjax.cli.viewer.session import Session
-from pigjax.cli.viewer.solids import pose_of, shape_of
+from pigjax.cli.viewer.stage import Stage
 from pigjax.core.errors import InputError, SimulationError
 from pigjax.mpm.materials import PRESETS
 from pigjax.mpm.materials.table import LIMITS
 
 _POLL = 1.0  # seconds between looks for new frames of a run
-_MOST_HANDLES = 1500  # particles by which matter can be dragged
 _OUT, _FIXED, _LAW = "not in the scene", "fixed", "its own law"
 _NUMBERS = tuple(name for name in LIMITS if name != "bulk")
-_TEXT = 0.1  # standard deviation of a typical splat in the page's own units, so that half precision holds it
 
 
 class Page:
@@ -40,17 +37,17 @@ class Page:
         self._pending: dict[str, Callable[[], None]] = {}
         self._wake = threading.Condition()
         self._closing = False
-        self._splats: dict[int, Any] = {}
-        self._nodes: dict[str, Any] = {}
         self._grabbed: Any = None
         self._selected = next((k for k in session.ids if k > 0), session.ids[0])
         self._polled = 0.0
-        typical = float(np.median(np.sqrt(np.trace(session._rest_covariances, axis1=1, axis2=2))))
-        self._scale = _TEXT / typical if typical > 0 else 1.0
-        self._set_the_stage()
+        self.stage = Stage(session, server, self._dragged)
         self._build_controls()
-        self._push_splats(session.ids)
-        self._push_extras()
+        self.stage.push_all()
+
+        @server.scene.on_click()
+        def _(event: Any) -> None:
+            self._do("click", lambda: self._click(event.ray_origin, event.ray_direction))
+
         self._thread = threading.Thread(target=self._work, name="pigjax-view", daemon=True)
         self._thread.start()
 
@@ -133,54 +130,11 @@ class Page:
             self.time.value = self.session.frame
         self._push_moved()
 
-    # what is drawn
-
-    def _set_the_stage(self) -> None:
-        session, scene = self.session, self.server.scene
-        scene.set_up_direction(tuple(float(value) for value in session.up))
-        away = (
-            np.array([1.0, -1.0, 0.0]) if abs(session.up[2]) > 0 else np.roll([1.0, 0.0, 1.0], int(abs(session.up[0])))
-        )
-        away = away - np.dot(away, session.up) * session.up + 0.6 * session.up
-        begin = self.server.initial_camera
-        begin.position = session.extent.centre + 3.2 * session.extent.radius * away / np.linalg.norm(away)
-        begin.look_at = session.extent.centre
-        begin.up = session.up
-        begin.near = float(session.extent.radius) / 200
-        begin.far = float(session.extent.radius) * 200
-
-        @scene.on_click()
-        def _(event: Any) -> None:
-            self._do("click", lambda: self._click(event.ray_origin, event.ray_direction))
-
-    def _push_splats(self, ids: list[int]) -> None:
-        """Draw objects, or draw them again."""
-        with self.server.atomic():
-            for number in ids:
-                means, covariances, rgb, opacities = self.session.shown(number)
-                values = {
-                    "centers": means * self._scale,
-                    "covariances": covariances * self._scale**2,
-                    "rgbs": rgb,
-                    "opacities": opacities[:, None],
-                }
-                if number in self._splats:
-                    self._splats[number].set_gaussians(**values)
-                else:
-                    name = f"/splats/{'unseen' if number < 0 else number}"
-                    self._splats[number] = self.server.scene.add_gaussian_splats(name, scale=1 / self._scale, **values)
-                self._splats[number].visible = number not in self.session.hidden
-
-    def _push_all(self) -> None:
-        for number in set(self._splats) - set(self.session.ids):
-            self._splats.pop(number).remove()
-        self._push_splats(self.session.ids)
-        self._push_extras()
-
     def _push_moved(self) -> None:
-        """Draw what a state moves."""
-        self._push_splats([number for number in self.session.moving_ids if number in self.session.groups])
-        self._push_extras()
+        self.stage.push_moved()
+        self._tell_time()
+
+    def _tell_time(self) -> None:
         self.clock.content = f"frame {self.session.frame}, {self.session.seconds:.3f} s" + self._legend()
 
     def _legend(self) -> str:
@@ -189,122 +143,21 @@ class Page:
             f"; {colour} from 0 to {end:.3g}" + (" m/s" if colour == "speed" else "") if colour in COLOURS[2:] else ""
         )
 
-    def _push_extras(self) -> None:
-        """Particles, colliders, the box, gravity, the ground, and the hand."""
-        session, scene = self.session, self.server.scene
-        with self.server.atomic():
-            self._push_particles()
-            self._push_handles()
-            for at, collider in enumerate(session.colliders):
-                name = f"/colliders/{at}"
-                if not self.colliders.value:
-                    self._drop(name)
-                    continue
-                if name not in self._nodes:
-                    self._nodes[name] = self._add_collider(name, collider)
-                if collider.moves or collider.rotation is not None:
-                    self._nodes[name].wxyz, self._nodes[name].position = pose_of(collider, session.seconds)
-            for name in [name for name in self._nodes if name.startswith("/colliders/")]:
-                if int(name.rpartition("/")[2]) >= len(session.colliders):
-                    self._drop(name)
-            bounds = session.bounds() if self.box.value else None
-            self._draw("/box", bounds, lambda pair: scene.add_line_segments("/box", _edges(*pair), (90, 90, 90)))
-            gravity = np.asarray(self.gravity.value)
-            show = self.arrow.value and np.any(gravity)
-            self._draw("/gravity", gravity if show else None, self._add_arrow)
-            held = session.live if session.live is not None and session.live.holds else None
-            self._draw("/hand", held, self._add_hand)
+    def _dragged(self, phase: str, particle: int, place: np.ndarray) -> None:
+        self._do("drag", lambda: self._drag(phase, particle, place))
 
-    def _push_particles(self) -> None:
-        points, colours = self.session.particles() if self.dots.value else (np.zeros((0, 3), np.float32), None)
-        if not len(points):
-            self._drop("/particles")
-            return
-        node = self._nodes.get("/particles")
-        if node is not None and node.points.shape == points.shape:
-            node.points, node.colors = points, colours
-            return
-        size = 0.25 * self.session._dx()
-        self._nodes["/particles"] = self.server.scene.add_point_cloud(
-            "/particles", points, colours, point_size=size, point_shape="circle", precision="float32"
-        )
-
-    def _push_handles(self) -> None:
-        """Invisible bodies at particles, by which the browser finds the matter under the mouse."""
-        live = self.session.live
-        if live is None:
-            self._drop("/matter")
-            return
-        x = np.asarray(live.particles.x, np.float32)
-        rows = np.arange(0, len(x), -(-len(x) // _MOST_HANDLES))
-        x = np.nan_to_num(x[rows], nan=1e6)
-        node = self._nodes.get("/matter")
-        if node is not None and node.batched_positions.shape == x.shape:
-            node.batched_positions = x
-            return
-        size = 0.75 * live.dx * max(len(live.particles) / 8 / len(rows), 1.0) ** (1 / 3)
-        turns = np.tile(np.array([1.0, 0, 0, 0], np.float32), (len(x), 1))
-        node = self.server.scene.add_batched_meshes_simple(
-            "/matter", _OCTAHEDRON * size, _FACES, turns, x, opacity=0.0, lod="off", cast_shadow=False,
-            receive_shadow=False,
-        )  # fmt: skip
-        self._nodes["/matter"] = node
-
-        @node.on_drag("left")
-        def _(event: Any) -> None:
-            index, place, phase = event.instance_index, np.asarray(event.end_position), event.phase
-            self._do("drag", lambda: self._drag(phase, rows, index, place))
-
-    def _drag(self, phase: str, rows: np.ndarray, index: int | None, place: np.ndarray) -> None:
+    def _drag(self, phase: str, particle: int, place: np.ndarray) -> None:
         live = self.session.live
         if live is None:
             return
         if phase == "end":
             live.release()
         else:
-            if not live.holds and index is not None:
-                live.grab(np.asarray(live.particles.x)[int(rows[index])], strength=self.strength.value)
+            if not live.holds:
+                live.grab(np.asarray(live.particles.x)[particle], strength=self.strength.value)
             live.move(place)
         if not self.playing:
-            self._push_extras()
-
-    def _draw(self, name: str, value: Any, add: Callable[[Any], Any]) -> None:
-        if value is None:
-            self._drop(name)
-        else:
-            self._nodes[name] = add(value)
-
-    def _drop(self, name: str) -> None:
-        node = self._nodes.pop(name, None)
-        if node is not None:
-            node.remove()
-
-    def _add_collider(self, name: str, collider: Any) -> Any:
-        vertices, faces = shape_of(collider, 2 * self.session.extent.radius)
-        if not len(faces):
-            return self.server.scene.add_point_cloud(
-                name, vertices.astype(np.float32), (150, 150, 160), point_size=0.2 * self.session._dx(),
-                precision="float32",
-            )  # fmt: skip
-        return self.server.scene.add_mesh_simple(
-            name, vertices, faces, color=(150, 150, 170), opacity=0.35, side="double", cast_shadow=False
-        )
-
-    def _add_arrow(self, gravity: np.ndarray) -> Any:
-        reach = self.session.extent.radius
-        start = self.session.extent.centre + 0.9 * reach * self.session.up
-        end = start + 0.5 * reach * gravity / np.linalg.norm(gravity)
-        return self._arrow("/gravity", start, end, (200, 60, 60))
-
-    def _add_hand(self, live: Live) -> Any:
-        return self._arrow("/hand", live.held, np.asarray(live.hand.target, float), (40, 120, 220))
-
-    def _arrow(self, name: str, start: np.ndarray, end: np.ndarray, colour: tuple[int, int, int]) -> Any:
-        wide = 0.01 * self.session.extent.radius
-        points = np.stack([start, end])[None]
-        return self.server.scene.add_arrows(
-            name, points, colour, shaft_radius=wide, head_radius=2.5 * wide, head_length=5 * wide
-        )
+            self.stage.push_extras()
 
     # controls
 
@@ -373,7 +226,7 @@ class Page:
         self.colliders = gui.add_checkbox("colliders", False)
         self.box = gui.add_checkbox("box of matter", False)
         for handle in (self.dots, self.colliders, self.box):
-            self._on(handle, "extras", self._push_extras)
+            self._on(handle, "extras", self._change_extras)
 
     def _build_objects(self, gui: Any) -> None:
         self.object = self._on(gui.add_dropdown("object", self._names()), "select", self._select_by_name)
@@ -396,7 +249,8 @@ class Page:
         vector = np.asarray(strength, float) if np.ndim(strength) else -float(strength) * session.up
         self.gravity = gui.add_vector3("gravity", tuple(vector.tolist()), step=0.5, hint="[m/s²]")
         self._on(self.gravity, "gravity", self._set_gravity)
-        self.arrow = self._on(gui.add_checkbox("gravity arrow", False), "extras", self._push_extras)
+        self.stage.gravity = vector
+        self.arrow = self._on(gui.add_checkbox("gravity arrow", False), "extras", self._change_extras)
         plane = session.draft.values.get("planes", {}).get("ground")
         bottom = (
             float(np.dot(session.extent.low, session.up))
@@ -408,7 +262,7 @@ class Page:
         self.height = gui.add_number("height", round(height, 4), step=0.01)
         self._on(self.ground, "ground", self._set_ground)
         self._on(self.height, "ground", self._set_ground)
-        self._draw_ground()
+        self._show_ground()
 
     # what the controls do, in the thread
 
@@ -436,7 +290,7 @@ class Page:
         self.stale = False
         self._say("ready; drag matter with the left button while it plays")
         self.time.visible = self.rate.visible = False
-        self._push_all()
+        self.stage.push_all()
 
     def _restart(self) -> None:
         self._stop_playing()
@@ -456,8 +310,13 @@ class Page:
     def _change_look(self) -> None:
         numbers = {name: handle.value for name, handle in self.numbers.items()}
         self.session.change_look(colour=self.colour.value, mode=self.mode.value, **numbers)
-        self._push_all()
-        self.clock.content = f"frame {self.session.frame}, {self.session.seconds:.3f} s" + self._legend()
+        self.stage.push_all()
+        self._tell_time()
+
+    def _change_extras(self) -> None:
+        boxes = {"particles": self.dots, "colliders": self.colliders, "box": self.box, "arrow": self.arrow}
+        self.stage.extras = {name for name, box in boxes.items() if box.value}
+        self.stage.push_extras()
 
     def _names(self) -> list[str]:
         return [f"{number}: {self.session.name_of(number)}" for number in self.session.ids]
@@ -495,12 +354,11 @@ class Page:
 
     def _toggle_visible(self) -> None:
         (self.session.hidden.discard if self.visible.value else self.session.hidden.add)(self._selected)
-        self._splats[self._selected].visible = self.visible.value
+        self.stage.show_visible()
 
     def _show(self, which: str) -> None:
         self.session.hidden = set() if which == "show all" else set(self.session.ids) - {self._selected}
-        for number, node in self._splats.items():
-            node.visible = number not in self.session.hidden
+        self.stage.show_visible()
         self.visible.value = True
 
     def _rename(self) -> None:
@@ -564,45 +422,23 @@ class Page:
         self.session.draft.set_gravity(self.gravity.value)
         if self.session.live is not None:
             self.session.live.set_gravity(self.gravity.value)
-        self._push_extras()
+        self.stage.gravity = np.asarray(self.gravity.value, float)
+        self.stage.push_extras()
 
     def _set_ground(self) -> None:
         up = self.session.up
         point = (self.height.value * up).tolist() if self.ground.value else None
         self.session.draft.set_ground(point, up.tolist())
         self.stale = True
-        self._draw_ground()
+        self._show_ground()
 
-    def _draw_ground(self) -> None:
-        self._drop("/ground")
-        if not self.ground.value:
-            return
-        session = self.session
-        axis = int(np.argmax(np.abs(session.up)))
-        middle = session.extent.centre + (self.height.value - np.dot(session.extent.centre, session.up)) * session.up
-        cell = float(f"{session.extent.radius / 4:.1g}")
-        self._nodes["/ground"] = self.server.scene.add_grid(
-            "/ground", 4 * session.extent.radius, 4 * session.extent.radius, plane=("yz", "xz", "xy")[axis],
-            cell_size=cell, section_size=4 * cell, position=middle, plane_color=(230, 230, 225), plane_opacity=0.3,
-        )  # fmt: skip
+    def _show_ground(self) -> None:
+        self.stage.ground = float(self.height.value) if self.ground.value else None
+        self.stage.draw_ground()
 
     def _write(self) -> None:
         path = self.session.draft.write(self.file.value, overwrite=self.replace.value)
         self._say(f"written to {path}; run it with: pigjax run {path}")
-
-
-# a body with few faces around a particle
-_OCTAHEDRON = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float32)
-_FACES = np.array(
-    [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]], np.uint32
-)  # fmt: skip
-
-
-def _edges(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """The twelve edges of a box, as pairs of points."""
-    corners = np.array(np.meshgrid(*[[0, 1]] * 3, indexing="ij")).reshape(3, -1).T
-    pairs = [(a, b) for a in range(8) for b in range(a) if np.abs(corners[a] - corners[b]).sum() == 1]
-    return (low + corners * (high - low))[np.array(pairs)].astype(np.float32)
 
 
 def _plain(text: str) -> str:

@@ -33,6 +33,7 @@ from pigjax.scene.schema import ClampSpec
 from pigjax.splatting.types import as_splats, extent_of
 
 MOST_SPLATS = 250_000  # that a browser draws smoothly on an ordinary machine
+_LIVE = 1  # Gaussians of a lattice cell that become particles in a live simulation; the others are carried
 MOST_PARTICLES = 20_000  # drawn as points
 
 
@@ -142,6 +143,11 @@ class Session:
         return () if self.plan is None else self.plan.colliders
 
     @property
+    def typical_size(self) -> float:
+        """Median over the splats of the root of their covariance's trace [m]."""
+        return float(np.median(np.sqrt(np.trace(self._rest_covariances[self.kept], axis1=1, axis2=2))))
+
+    @property
     def seconds(self) -> float:
         """Simulated time of what is drawn [s]."""
         return 0.0 if self._moment is None else self._moment.seconds
@@ -176,7 +182,7 @@ class Session:
         if self._moment is None:
             return None
         x = self._moment.x[np.isfinite(self._moment.x).all(1)]
-        dx = self._dx()
+        dx = self.dx()
         return (np.floor(x.min(0) / dx) - 1) * dx, (np.ceil(x.max(0) / dx) + 1) * dx
 
     def pick(self, origin: Any, direction: Any) -> tuple[int, Hit] | None:
@@ -238,7 +244,7 @@ class Session:
         Raises:
             SceneError: the scene is impossible; the message names the field.
         """
-        self._take_plan()
+        self._take_plan(gaussians_per_cell=_LIVE)
         assert self.plan is not None
         scene = self.draft.scene()
         names = [name for name, spec in scene.objects.items() if not spec.fixed]
@@ -282,9 +288,10 @@ class Session:
             self._means[rows], self._covariances[rows] = means[known], covariances[known]
         self.drawing_seconds = time.perf_counter() - begun
 
-    def _take_plan(self) -> None:
+    def _take_plan(self, gaussians_per_cell: int | None = None) -> None:
         scene = self.draft.scene()
-        self.plan = make_plan(scene, self.opened.inputs(scene), self.opened.all_labels())
+        inputs, labels = self.opened.inputs(scene), self.opened.all_labels()
+        self.plan = make_plan(scene, inputs, labels, gaussians_per_cell=gaussians_per_cell)
         self.poser = Poser(self.opened.gaussians, self.plan.particles, self.plan.binding)
         object_id = np.asarray(self.plan.labels.object_id)
         if not np.array_equal(object_id, self.opened.object_id):  # buried Gaussians went to still objects
@@ -324,7 +331,8 @@ class Session:
         ids = self.opened.inputs(scene).ids
         return [ids[name] for name, spec in scene.objects.items() if not spec.fixed] or [0]
 
-    def _dx(self) -> float:
+    def dx(self) -> float:
+        """Grid spacing of what is simulated [m]."""
         return self.live.dx if self.live is not None else self.draft.scene().simulation.dx
 
     def _most_visible(self) -> Bool[np.ndarray, "n"]:
