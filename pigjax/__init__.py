@@ -6,9 +6,11 @@ Pipeline: files (`io`) → Gaussians (`reconstruction`, or a trained file) → o
 """
 
 from pigjax.clamp import ClampParams, eigen_clamp
+from pigjax.core import __version__ as __version__
 from pigjax.core.camera import Camera, interpolate_path, look_at, orbit, stack_cameras
 from pigjax.core.errors import InputError, MissingFileError, SceneError, SimulationError
 from pigjax.core.metrics import boundary_iou, mean_iou, psnr, ssim
+from pigjax.core.placing import as_gaussians, placed
 from pigjax.core.regions import BoxRegion, HalfSpace, SphereRegion
 from pigjax.coupling.binding import at_frame, bind, deform
 from pigjax.coupling.sdf_collider import collider_from_gaussians
@@ -22,7 +24,9 @@ from pigjax.io import (
     load_points,
     load_views,
     origin_of,
+    save_glb,
     save_ply,
+    save_usd,
     write_video,
 )
 from pigjax.mls_mpm import SimConfig, rollout, step
@@ -38,7 +42,7 @@ from pigjax.objects.editing import extract_object, hole_mask, remove_object
 from pigjax.objects.evaluation import evaluate_labels
 from pigjax.reconstruction.prune import contributions, prune
 from pigjax.reconstruction.reconstruct import FitConfig, reconstruct
-from pigjax.scene import RunReport, Scene, load_scene, run_scene
+from pigjax.scene import Run, RunReport, Scene, export_run, load_run, load_scene, run_scene
 from pigjax.segmentation import Labels, fill_unseen, lift_masks, object_mask
 from pigjax.splat import (
     Frame,
@@ -51,9 +55,6 @@ from pigjax.splat import (
 )
 from pigjax.study import Experiment, experiment, load_study, sweep_study, tune_study
 from pigjax.study.optimize import Bounds, Table, fit, load_table, search, sweep
-
-__version__ = "0.1.0"
-
 
 __all__ = [
     "Association",
@@ -83,6 +84,7 @@ __all__ = [
     "Particles",
     "Plane",
     "RenderConfig",
+    "Run",
     "RunReport",
     "SampledDistance",
     "Scene",
@@ -98,6 +100,7 @@ __all__ = [
     "Trajectory",
     "Views",
     "Wind",
+    "as_gaussians",
     "associate_masks",
     "at_frame",
     "bind",
@@ -111,6 +114,7 @@ __all__ = [
     "eigen_clamp",
     "evaluate_labels",
     "experiment",
+    "export_run",
     "extract_object",
     "fill_unseen",
     "fit",
@@ -124,6 +128,7 @@ __all__ = [
     "load_masks",
     "load_ply",
     "load_points",
+    "load_run",
     "load_scene",
     "load_study",
     "load_table",
@@ -135,6 +140,7 @@ __all__ = [
     "object_mask",
     "orbit",
     "origin_of",
+    "placed",
     "preset",
     "prune",
     "psnr",
@@ -144,7 +150,9 @@ __all__ = [
     "required_capacity",
     "rollout",
     "run_scene",
+    "save_glb",
     "save_ply",
+    "save_usd",
     "search",
     "seed_particles",
     "ssim",

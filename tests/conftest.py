@@ -1,5 +1,6 @@
 """Every test runs with jaxtyping + beartype on the whole package, and with strict JAX modes."""
 
+import gc
 import os
 import shutil
 import subprocess
@@ -14,8 +15,8 @@ from jaxtyping import install_import_hook
 hook = install_import_hook("pigjax", "beartype.beartype")
 os.environ.setdefault("PIGJAX_SHORT", "1")  # notebooks run in their short form
 
-# Compiles in half the processor time, to code that runs slower: tests, but for the slow ones, compile far more than
-# they compute. Notebooks and commands that tests start are compiled as users' are.
+# Compiles in half the processor time, to code that runs slower: tests and short notebooks, but for the slow ones,
+# compile far more than they compute. Commands that tests start are compiled as users' are.
 QUICK = (
     "--xla_cpu_parallel_codegen_split_count=1",
     "--xla_cpu_use_fusion_emitters=false",
@@ -47,6 +48,26 @@ def pytest_configure(config):
         os.environ.pop("XLA_FLAGS", None)
     else:
         os.environ["XLA_FLAGS"] = given
+
+
+def pytest_collection_finish():
+    """Tracing makes objects by the million, and what was imported is no garbage: it is looked through less often."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item):
+    """The process of a notebook reads the flags as well; those given from outside win."""
+    quick = item.path.suffix == ".ipynb" and "XLA_FLAGS" not in os.environ and ACCEPTED in os.environ
+    if quick:
+        os.environ["XLA_FLAGS"] = os.environ[ACCEPTED]
+    try:
+        return (yield)
+    finally:
+        if quick:
+            del os.environ["XLA_FLAGS"]
 
 
 def share_compiled_programs(config):

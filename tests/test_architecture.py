@@ -174,7 +174,8 @@ import time
 begun = time.process_time()
 import jax, jax.numpy, equinox, optax, msgspec, scipy.optimize, scipy.spatial, scipy.ndimage
 libraries, before = time.process_time(), dict(jax.config.values)
-import pigjax
+import pigjax, sys
+assert "warp" not in sys.modules, "Warp is imported where it is taken only"
 print(libraries - begun, time.process_time() - libraries)
 assert before.items() <= dict(jax.config.values).items(), "jax.config changed"
 """

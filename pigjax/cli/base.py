@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import time
 from collections.abc import Iterator
@@ -48,6 +49,10 @@ Changes = Annotated[
     typer.Option(
         "--set", metavar="FIELD=VALUE", help="Replace a field of the file: --set simulation.frames=8; repeat it."
     ),
+]
+Images = Annotated[
+    Path | None,
+    typer.Option("--images", metavar="DIR", help="Folder of the photos, if not the one that the cameras' file names."),
 ]
 Origin = Annotated[
     tuple[float, float, float] | None,
@@ -117,9 +122,14 @@ def row(*cells: object) -> tuple[Text, ...]:
 
 
 def prepare_jax() -> None:
-    """Use all cores, and keep compiled programs for the next command."""
+    """Use all cores, keep compiled programs for the next command, and look for garbage less often.
+
+    Tracing makes objects by the million, and hardly any of them is garbage: looking at the default rate slows it down.
+    """
     one_device_per_core()
     use_compile_cache()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
 
 
 def one_device_per_core() -> None:

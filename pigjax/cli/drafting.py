@@ -9,6 +9,7 @@ from pigjax import io
 from pigjax.core.errors import InputError
 from pigjax.io.finding import Found
 from pigjax.scene.draft import Draft, draft_scene, thumbnails
+from pigjax.splat import Gaussians
 
 # every name that the commands below show is a folder of the user's, in quotes for a shell
 MASK_LAYOUT = "object_mask/<photo's name>.png with 8- or 16-bit ids: 0 background, one id an object in all photos"
@@ -26,12 +27,12 @@ def write_draft(found: Found, folder: Path, *, up: str | None, ask: Callable[[st
     Raises:
         InputError: as `draft_scene`, or a file cannot be written.
     """
-    if found.gaussians is None:
+    if (splats := found.gaussians) is None:
         raise InputError("a draft needs trained splats.")
 
-    def drafted(up: str | None):
+    def drafted(up: str | None) -> tuple[Draft, Gaussians, io.Views | None]:
         return draft_scene(
-            found.gaussians, folder, views_path=found.views, masks_path=found.masks, names_path=found.names, up=up
+            splats, folder, views_path=found.views, masks_path=found.masks, names_path=found.names, up=up
         )
 
     draft, gaussians, views = drafted(up)

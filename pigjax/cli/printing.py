@@ -12,9 +12,9 @@ from pigjax.cli.base import answers, app, console, row, said
 
 def _tell_version(wanted: bool) -> bool:
     if wanted:
-        import pigjax
+        from pigjax.core import __version__
 
-        answers.print(said(f"pigjax {pigjax.__version__}"))
+        answers.print(said(f"pigjax {__version__}"))
         raise typer.Exit
     return wanted
 

@@ -104,7 +104,7 @@ def _run(
                 tasks[stage] = bar.add_task(stage, total=of)
             bar.update(tasks[stage], completed=done, total=of)
 
-        report = run_scene(scene, out, progress=tell, overwrite=overwrite)
+        report = run_scene(scene, out, progress=tell, say=lambda line: console.print(said(line)), overwrite=overwrite)
     table = Table("stage", "run s", "compile s")
     for name, spent in report.times.items():
         table.add_row(*row(name, f"{spent.run:.1f}", f"{spent.compile:.1f}"))

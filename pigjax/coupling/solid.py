@@ -246,10 +246,11 @@ def _discs_of(
 def _disc_samples(shell: Shell, kept: Bool[np.ndarray, "n"], voxel: float) -> Float[np.ndarray, "s 3"]:
     """Points on each Gaussian's disc of one standard deviation, about one per voxel; a round one gives its centre.
 
-    Discs are clamped to a quarter of the object, since wider Gaussians do not describe its surface.
+    Discs are clamped to a quarter of the object, and to twice the distance to their sixth neighbour: wider Gaussians do
+    not describe its surface, which their neighbours do there, but stand out from it wherever it is curved.
     """
     means, axes = shell.means[kept], shell.axes[kept]
-    widest = np.ptp(means, axis=0).max() / 8
+    widest = _widest(means, voxel)[:, None]
     lengths = np.linalg.norm(axes, axis=1)
     # the extent along the shortest axis is blur; it is subtracted from the other two
     extent = np.minimum(np.sqrt(np.maximum(lengths[:, :2] ** 2 - lengths[:, 2:] ** 2, 0)), widest)
@@ -263,6 +264,15 @@ def _disc_samples(shell: Shell, kept: Bool[np.ndarray, "n"], voxel: float) -> Fl
     angle = index * np.pi * (3 - np.sqrt(5))  # a sunflower's spiral covers a disc evenly
     planar = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1) * extent[owner]
     return means[owner] + np.einsum("sij,sj->si", directions[owner], planar)
+
+
+def _widest(means: Float[np.ndarray, "n 3"], voxel: float) -> Float[np.ndarray, "n"]:
+    """Largest radius of each disc [m]."""
+    quarter = np.ptp(means, axis=0).max() / 8
+    if len(means) < 7:
+        return np.full(len(means), quarter)
+    distances, _ = cKDTree(means).query(means, k=7, workers=-1)
+    return np.minimum(quarter, np.maximum(2 * distances[:, -1], voxel))
 
 
 def _sky(

@@ -99,8 +99,7 @@ def draft_scene(
     names = {} if names_path is None else io.load_names(names_path)
     views = None
     if views_path is not None:
-        masks = {} if masks_path is None else {"masks": masks_path, "missing_masks": "abstain"}
-        views = io.load_views(views_path, **masks)
+        views = io.load_views(views_path, masks=masks_path, missing_masks="abstain")
     core = extent_of(gaussians).core
     means = np.asarray(gaussians.means, np.float64)
     remarks: list[str] = []
@@ -363,7 +362,7 @@ def _text(
         f"# object is {tall:.3g} units tall here. If that is not its height in metres, it weighs too much or too",
         "# little for its stiffness: multiply young (and yield_stress, cohesion) by units per metre.",
         "[simulation]",
-        f"dx = {dx:g} # grid spacing [m]: a sixteenth of the smallest moving object; smaller is finer and slower",
+        f"# dx = {dx:g} # grid spacing [m]; left out, a sixteenth of the smallest moving object; smaller is slower",
         "frames = 48",
         "fps = 24 # frames a second of the video",
         "gravity = 9.81 # m/s², against up",

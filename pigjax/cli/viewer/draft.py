@@ -12,9 +12,9 @@ from pigjax import io
 from pigjax.core.errors import InputError, SceneError
 from pigjax.mpm.materials import PRESETS
 from pigjax.scene import Scene, scene_from
+from pigjax.scene.schema import INPUT_FILES
 
 GROUND = "ground"
-_PATHS = {"gaussians", "views", "masks", "names", "labels"}  # of `input`
 _ROUND = 6  # digits of numbers from a page
 
 
@@ -148,8 +148,11 @@ class Draft:
         if path.exists() and not overwrite:
             raise InputError(f"{path.name}: is there already; choose another name, or tick 'replace'.")
         values = copy.deepcopy(self.values)
-        for key in _PATHS & values["input"].keys():
+        for key in set(INPUT_FILES) & values["input"].keys():
             values["input"][key] = os.path.relpath(self.base / values["input"][key], self.folder)
+        for table in values.get("objects", {}).values():
+            if "gaussians" in table:
+                table["gaussians"] = os.path.relpath(self.base / table["gaussians"], self.folder)
         io.write_toml(path, values)
         return path
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import equinox as eqx
@@ -12,14 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from pigjax.core.errors import InputError, SimulationError
-from pigjax.mpm import Health, vast_grid
+from pigjax.mpm import Health
 from pigjax.mpm.active_grid import ActiveGrid
 from pigjax.mpm.forces import Spring, grab
 from pigjax.mpm.materials import LAWS, Material, material_table
 from pigjax.mpm.materials.parameters import Parameters
-from pigjax.mpm.simulate import simulate
-from pigjax.mpm.timestep import SubstepRule, substep_rule
 from pigjax.scene.plan import Plan
+from pigjax.scene.stages import Stage, simulate_stages, stages_of
 
 _REACH = 2.5  # cells around the picked point that a drag takes hold of
 _MOST_FRAMES = 100_000
@@ -55,12 +54,11 @@ class Live:
 
     Args:
         plan: of the scene.
-        dx: grid spacing [m].
         objects: names of the moving objects, in the order of the rows of the plan's table.
     """
 
-    def __init__(self, plan: Plan, dx: float, objects: list[str]) -> None:
-        self.plan, self.dx, self.objects = plan, dx, objects
+    def __init__(self, plan: Plan, objects: list[str]) -> None:
+        self.plan, self.dx, self.objects = plan, plan.dx, objects
         self.table = plan.table
         self.gravity = np.asarray(plan.gravity, float)
         self.pace = Pace()
@@ -78,7 +76,7 @@ class Live:
         # drawn deformation of matter whose present shape has become its rest shape: F = F_visual @ F_before
         self._before: Float[np.ndarray, "p 3 3"] | None = None
         self._active = ActiveGrid()
-        self._rule: SubstepRule | None = None
+        self._stages: list[Stage] = []
 
     def advance(self) -> Health:
         """Simulate one frame, with the drag of the moment.
@@ -87,28 +85,11 @@ class Live:
             SimulationError: the simulation broke down; the last good frame stays.
         """
         begun = time.perf_counter()
-        domain = vast_grid(self.dx)
-        given: dict[str, Any] = {
-            "frame_dt": self.plan.frame_dt,
-            "gravity": self.gravity,
-            "colliders": self.plan.colliders,
-            "forces": (*self.plan.forces, self.hand),
-        }
-        if self._rule is None:
-            self._rule = substep_rule(
-                self.particles, domain, self.table, self.plan.config, frames=_MOST_FRAMES, **given
-            )
-        frames = simulate(
-            self.particles,
-            domain,
-            self.table,
-            self._rule._replace(forces=given["forces"]),
-            frames=range(self.frame, self.frame + 1),
-            contact=self.plan.contact,
-            active_grid=self._active,
-            **given,
-        )
-        (result,) = frames
+        plan = replace(self.plan, table=self.table, gravity=self.gravity, forces=(*self.plan.forces, self.hand))
+        if not self._stages:
+            self._stages = stages_of(plan, _MOST_FRAMES)
+        stages = [stage._replace(rule=stage.rule._replace(forces=plan.forces)) for stage in self._stages]
+        (result,) = simulate_stages(plan, stages, self.particles, range(self.frame, self.frame + 1), self._active)
         if result.health.is_broken():
             problems = ", ".join(result.health.problems())
             raise SimulationError(f"frame {self.frame + 1}: {problems}; make matter softer, or drag more gently.")
@@ -182,7 +163,7 @@ class Live:
         self.particles = eqx.tree_at(lambda q: q.mass, p, jnp.asarray(mass, p.x.dtype))
         if changes:
             self._forget_shape(mine)
-        self._rule = None
+        self._stages = []
 
     def _material(self, row: int) -> Material:
         numbers = self.table.rows(row)
@@ -209,7 +190,7 @@ class Live:
     def set_gravity(self, gravity: Any) -> None:
         """Change gravity [m/s²]."""
         self.gravity = np.asarray(gravity, float)
-        self._rule = None
+        self._stages = []
 
     def moves(self, name: str) -> bool:
         """Whether an object is of matter that moves."""

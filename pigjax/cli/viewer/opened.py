@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Int
 
 from pigjax import io
-from pigjax.core.checks import shown
-from pigjax.core.errors import InputError, SceneError
+from pigjax.core.errors import InputError
 from pigjax.scene import Scene, scene_from
+from pigjax.scene.arrangement import arrange
 from pigjax.scene.plan import Inputs, read_inputs, segment
+from pigjax.scene.replay import Run, load_run
 from pigjax.scene.schema import read_file
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians
@@ -38,22 +39,25 @@ class Opened:
     names: dict[int, str]  # of ids
     values: dict[str, Any]  # of the scene file
     base: Path  # of the paths in these values
-    states: Path | None = None  # folder of the states of a run
     accuracy: str | None = None
-    labels: Labels | None = None
+    run: Run | None = None
+    read: Inputs | None = None  # files of the scene; None: of a run, which reads them when they are needed
+    labels: Labels | None = None  # as lifted
     notes: list[str] = field(default_factory=list)
 
-    def inputs(self, scene: Scene) -> Inputs:
-        """What `make_plan` needs, for the objects of a scene."""
-        named = {name: number for number, name in self.names.items()}
-        ids = {name: named.get(name, -1) if spec.id is None else spec.id for name, spec in scene.objects.items()}
-        return Inputs(self.gaussians, None, ids, self.names)
+    def prepared(self, scene: Scene) -> tuple[Scene, Inputs, Labels]:
+        """What `make_plan` needs, for the objects of a scene.
 
-    def all_labels(self) -> Labels:
-        """Labels as they were lifted, or one that says no more than `object_id`."""
-        if self.labels is not None:
-            return self.labels
-        return _plain_labels(self.object_id)
+        Raises:
+            InputError: a file of a run's scene is missing, or has changed.
+        """
+        if self.read is None:
+            self.read = read_inputs(scene)
+            self.labels = segment(scene, self.read)
+        assert self.labels is not None
+        named = {name: number for number, name in self.names.items()} | self.read.ids
+        ids = {name: named.get(name, -1) if spec.id is None else spec.id for name, spec in scene.objects.items()}
+        return arrange(scene, replace(self.read, ids=ids), self.labels)
 
 
 def open_path(
@@ -83,8 +87,8 @@ def open_path(
         return _open_splats(path, drop_invalid, origin, up or "z")
     if path.suffix == ".toml":
         return _open_scene(read_file(path, "scene file"), path.parent, path.name, accuracy, tell)
-    if (path / "scene.json").is_file() and (path / "states").is_dir():
-        return _open_run(path, tell)
+    if (path / "states").is_dir() and (path / "scene.toml").is_file():
+        return _open_run(path)
     if (path / "labels.npz").is_file() and (path / "objects").is_dir():
         return _open_segments(path, drop_invalid, up or "z")
     if (path / "scene.toml").is_file():
@@ -102,7 +106,7 @@ def _open_splats(path: Path, drop_invalid: bool, origin: Any, up: str) -> Opened
     if stored.is_file():
         try:
             ids = io.load_labels(stored, len(gaussians), scene=io.digest_of_scene(gaussians)).object_id
-            names = {}
+            names = {int(number): f"object-{number}" for number in np.unique(ids[ids > 0])}
         except InputError as error:
             notes.append(f"labels.npz beside it is not its own: {error}")
     values = new_values(gaussians, path.name, names, up)
@@ -110,7 +114,9 @@ def _open_splats(path: Path, drop_invalid: bool, origin: Any, up: str) -> Opened
         values["input"]["origin"] = [float(value) for value in origin]
     if drop_invalid:
         values["input"]["drop_invalid"] = True
-    return Opened(path.name, path.parent, gaussians, ids, names, values, path.parent, notes=notes)
+    if len(names) > 1:
+        values["input"]["labels"] = stored.name
+    return _of_splats(path.name, path.parent, gaussians, ids, names, values, notes)
 
 
 def _open_scene(
@@ -120,48 +126,31 @@ def _open_scene(
     tell("read")
     inputs = read_inputs(scene)
     tell("segment")
-    labels = segment(scene, inputs)
-    names = {**inputs.names, **{number: name for name, number in inputs.ids.items()}}
-    object_id = np.asarray(labels.object_id)
-    return Opened(title, folder, inputs.gaussians, object_id, names, values, folder, accuracy=accuracy, labels=labels)
-
-
-def _open_run(path: Path, tell: Callable[[str], None]) -> Opened:
-    told = io.read_json(path / "scene.json")
-    try:
-        # its numbers are those of its level of accuracy, which is not to be applied twice
-        values = _given({**told["scene"], "accuracy": "standard"})
-        values.pop("folder", None)
-        scene = scene_from(values, folder=told["folder"], where=str(path / "scene.json"))
-    except (TypeError, KeyError, AttributeError):
-        raise SceneError(f"{path / 'scene.json'}: is not what 'pigjax run' writes; run the scene again.") from None
-    tell("read")
-    spec = scene.input
-    gaussians = io.load_gaussians(scene.path(spec.gaussians), drop_invalid=spec.drop_invalid, origin=spec.origin)
-    names = {} if spec.names is None else io.load_names(scene.path(spec.names))
-    if (path / "labels.npz").is_file():
-        stored = io.load_labels(path / "labels.npz", len(gaussians))
-        columns = None if stored.ids is None else jnp.asarray(stored.ids)
-        labels = Labels(
-            jnp.asarray(stored.object_id), jnp.asarray(stored.votes), jnp.asarray(stored.confidence), ids=columns
-        )
-    else:  # a run that has just begun
-        tell("segment")
-        labels = segment(scene, read_inputs(scene))
-    opened = Opened(
-        path.name, path, gaussians, np.asarray(labels.object_id), names, values, Path(told["folder"]),
-        states=path / "states", accuracy="standard", labels=labels,
+    lifted = segment(scene, inputs)
+    _, shown_inputs, labels = arrange(scene, inputs, lifted)
+    names = {**inputs.names, **{number: name for name, number in shown_inputs.ids.items()}}
+    return Opened(
+        title, folder, shown_inputs.gaussians, np.asarray(labels.object_id), names, values, folder,
+        accuracy=accuracy, read=inputs, labels=lifted,
     )  # fmt: skip
-    ids = opened.inputs(scene).ids
-    opened.names = {**names, **{number: name for name, number in ids.items() if number >= 0}}
-    return opened
 
 
-def _given(values: Any) -> Any:
-    """Tables without the fields that are None, which TOML cannot say."""
-    if isinstance(values, dict):
-        return {key: _given(value) for key, value in values.items() if value is not None}
-    return values
+def _open_run(path: Path) -> Opened:
+    run = load_run(path)
+    names = {number: name for name, number in run.ids.items()}
+    values = read_file(path / "scene.toml", "scene file")
+    return Opened(path.name, path, run.gaussians, run.object_id, names, values, path, accuracy="standard", run=run)
+
+
+def _of_splats(
+    title: str, folder: Path, gaussians: Gaussians, ids: Any, names: dict[int, str], values: dict[str, Any],
+    notes: list[str],
+) -> Opened:  # fmt: skip
+    read = Inputs(gaussians, None, {name: number for number, name in names.items()}, names)
+    return Opened(
+        title, folder, gaussians, np.asarray(ids), names, values, folder, read=read, labels=_plain_labels(ids),
+        notes=notes,
+    )  # fmt: skip
 
 
 def _open_segments(path: Path, drop_invalid: bool, up: str) -> Opened:
@@ -181,7 +170,7 @@ def _open_segments(path: Path, drop_invalid: bool, up: str) -> Opened:
     gaussians = jax.tree.map(lambda *parts: jnp.concatenate(parts), *(_widened(cloud, widest) for cloud in clouds))
     values = new_values(gaussians, "gaussians.ply", names, up)
     note = "a scene file needs the photos and masks that these objects came from: add input.views"
-    return Opened(path.name, path, gaussians, np.concatenate(ids), names, values, path, notes=[note])
+    return _of_splats(path.name, path, gaussians, np.concatenate(ids), names, values, [note])
 
 
 def _widened(gaussians: Gaussians, bands: int) -> Gaussians:
@@ -205,15 +194,3 @@ def new_values(gaussians: Gaussians, file: str, names: dict[int, str], up: str) 
         "simulation": {"dx": dx, "frames": _FRAMES},
         "objects": {name: {"id": number, "material": "jelly"} for number, name in names.items() if number > 0},
     }
-
-
-def up_of(values: dict[str, Any]) -> str:
-    """Name of the axis that points up.
-
-    Raises:
-        SceneError: the file has none of the known ones.
-    """
-    up = values.get("input", {}).get("up", "z")
-    if not isinstance(up, str) or up.removeprefix("-") not in ("x", "y", "z"):
-        raise SceneError(f"input.up = {shown(up)}: choose one of x, y, z, -x, -y, -z.")
-    return up

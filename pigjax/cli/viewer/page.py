@@ -116,7 +116,7 @@ class Page:
     def _poll(self) -> None:
         """Look for new frames of a run that goes on."""
         now = time.monotonic()
-        if self.session.opened.states is None or self.session.live is not None or now - self._polled < _POLL:
+        if self.session.opened.run is None or self.session.live is not None or now - self._polled < _POLL:
             return
         self._polled = now
         frames = self.session.refresh_frames()
@@ -196,7 +196,7 @@ class Page:
         session = self.session
         self.play = self._on(gui.add_button("play", icon="player-play"), "play", self._toggle, click=True)
         last = max(session.frames, default=0)
-        is_run = session.opened.states is not None
+        is_run = session.opened.run is not None
         self.time = gui.add_slider("frame", 0, max(last, 1), 1, 0, visible=is_run)
         self._on(self.time, "time", lambda: self._seek(self.time.value))
         self.rate = gui.add_slider("frames/s", 1, 60, 1, 24, visible=is_run)

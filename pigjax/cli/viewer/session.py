@@ -23,13 +23,16 @@ from pigjax.cli.viewer.colouring import (
 )
 from pigjax.cli.viewer.draft import Draft
 from pigjax.cli.viewer.live import Live
-from pigjax.cli.viewer.opened import Opened, up_of
+from pigjax.cli.viewer.opened import Opened
 from pigjax.cli.viewer.picking import Hit, pick_splat
 from pigjax.cli.viewer.posing import MODES, Poser
 from pigjax.core.errors import InputError
 from pigjax.mpm.colliders import Collider
-from pigjax.scene.plan import Plan, axis_of, make_plan
+from pigjax.scene.plan import make_plan
+from pigjax.scene.replay import Run
 from pigjax.scene.schema import ClampSpec
+from pigjax.scene.world import axis_of
+from pigjax.splat import Gaussians
 from pigjax.splatting.types import as_splats, extent_of
 
 MOST_SPLATS = 250_000  # that a browser draws smoothly on an ordinary machine
@@ -96,17 +99,10 @@ class Session:
         self.draft = Draft(opened.values, opened.base, opened.folder, accuracy=opened.accuracy)
         clamp = {k: v for k, v in opened.values.get("clamp", {}).items() if k in ClampSpec.__struct_fields__}
         self.look = replace(self.look, **clamp)
-        self.up = axis_of(up_of(opened.values))
+        self.up = axis_of(opened.values.get("input", {}).get("up", "z"))
         self.extent = extent_of(opened.gaussians)
-        rest = as_splats(opened.gaussians)
-        factors = np.asarray(rest.factors, np.float64)
-        self.opacities: Float[np.ndarray, "n"] = np.asarray(rest.opacities)
-        self._rest_means = np.asarray(rest.means, np.float32)
-        self._rest_covariances = np.einsum("nij,nkj->nik", factors, factors).astype(np.float32)
-        self._photo = photo_colours(np.asarray(rest.sh))
-        self.kept: Bool[np.ndarray, "n"] = self._most_visible()
-        self.groups = self._grouped()
-        self.plan: Plan | None = None
+        self._take_splats(opened.gaussians, opened.object_id)
+        self._object_of_particle = np.zeros(0, int)
         self.poser: Poser | None = None
         self.live: Live | None = None
         self.frame = 0
@@ -115,9 +111,9 @@ class Session:
         self.drawing_seconds = 0.0
         self._moment: _Moment | None = None
         self._to_rest()
-        if opened.states is not None:
-            self._take_plan()
-            self.refresh_frames()
+        self.colliders: tuple[Collider, ...] = ()
+        if opened.run is not None:
+            self._take_run(opened.run)
         self.redraw()
 
     # what there is
@@ -136,11 +132,6 @@ class Session:
     def moving_ids(self) -> list[int]:
         """Objects whose splats a state moves."""
         return [] if self.poser is None else np.unique(self.opened.object_id[self.poser.rows]).tolist()
-
-    @property
-    def colliders(self) -> tuple[Collider, ...]:
-        """Of the simulation that is shown."""
-        return () if self.plan is None else self.plan.colliders
 
     @property
     def typical_size(self) -> float:
@@ -164,14 +155,13 @@ class Session:
 
     def particles(self, most: int = MOST_PARTICLES) -> tuple[Float[np.ndarray, "k 3"], UInt8[np.ndarray, "k 3"]]:
         """Positions of particles, and their colours; evenly thinned to at most so many."""
-        if self._moment is None or self.plan is None:
+        if self._moment is None:
             return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
         rows = np.arange(0, len(self._moment.x), -(-len(self._moment.x) // most))
         x = self._moment.x[rows]
         values = self._values()
         if values is None:
-            bodies = np.asarray(self.plan.particles.body)[rows]
-            colours = object_colours(np.array(self._ids_of_bodies(), np.int64)[bodies])
+            colours = object_colours(self._object_of_particle[rows])
         else:
             colours = value_colours(values[rows], self.scale_end)
         known = np.isfinite(x).all(1)
@@ -215,8 +205,8 @@ class Session:
 
     def refresh_frames(self) -> list[int]:
         """Frames of the run that are on disk by now."""
-        if self.opened.states is not None:
-            self.frames = io.state_frames(self.opened.states)
+        if self.opened.run is not None:
+            self.frames = io.state_frames(self.opened.run.folder / "states")
         return self.frames
 
     def show_frame(self, frame: int) -> None:
@@ -225,17 +215,13 @@ class Session:
         Raises:
             InputError: its state is damaged, or belongs to another scene.
         """
-        if self.opened.states is None or not self.frames:
+        run = self.opened.run
+        if run is None or not self.frames:
             return
         self.frame = max((kept for kept in self.frames if kept <= frame), default=self.frames[0])
-        state = io.load_state(self.opened.states, self.frame)
-        assert self.plan is not None
-        if state["x"].shape != self.plan.particles.x.shape:
-            raise InputError(
-                f"{self.opened.states}: frame {self.frame} has {len(state['x'])} particles, its scene"
-                f" {len(self.plan.particles)}; the files of the scene have changed since, run it again."
-            )
-        self._moment = _Moment(state["x"], state["v"], state["F_visual"], self.frame * self.plan.frame_dt)
+        now = run.particles(self.frame)
+        x, v, F = (np.asarray(values) for values in (now.x, now.v, now.F_visual))
+        self._moment = _Moment(x, v, F, self.frame * self._frame_dt(run))
         self.redraw()
 
     def start_live(self) -> Live:
@@ -244,11 +230,15 @@ class Session:
         Raises:
             SceneError: the scene is impossible; the message names the field.
         """
-        self._take_plan(gaussians_per_cell=_LIVE)
-        assert self.plan is not None
-        scene = self.draft.scene()
+        scene, inputs, labels = self.opened.prepared(self.draft.scene())
+        plan = make_plan(scene, inputs, labels, gaussians_per_cell=_LIVE)
         names = [name for name, spec in scene.objects.items() if not spec.fixed]
-        self.live = Live(self.plan, scene.simulation.dx, names)
+        self._take_splats(inputs.gaussians, np.asarray(plan.labels.object_id))
+        self.opened.names |= {number: name for name, number in inputs.ids.items()}
+        self.poser = Poser(inputs.gaussians, plan.particles, plan.binding)
+        self.colliders = plan.colliders
+        self._object_of_particle = np.array([inputs.ids[name] for name in names])[np.asarray(plan.particles.body)]
+        self.live = Live(plan, names)
         self._to_rest()
         self._follow_live()
         return self.live
@@ -271,7 +261,7 @@ class Session:
 
     def stop_live(self) -> None:
         """Show the scene at rest again."""
-        self.live, self._moment, self.poser, self.plan = None, None, None, None
+        self.live, self._moment, self.poser, self.colliders = None, None, None, ()
         self._to_rest()
         self.redraw()
 
@@ -288,15 +278,27 @@ class Session:
             self._means[rows], self._covariances[rows] = means[known], covariances[known]
         self.drawing_seconds = time.perf_counter() - begun
 
-    def _take_plan(self, gaussians_per_cell: int | None = None) -> None:
-        scene = self.draft.scene()
-        inputs, labels = self.opened.inputs(scene), self.opened.all_labels()
-        self.plan = make_plan(scene, inputs, labels, gaussians_per_cell=gaussians_per_cell)
-        self.poser = Poser(self.opened.gaussians, self.plan.particles, self.plan.binding)
-        object_id = np.asarray(self.plan.labels.object_id)
-        if not np.array_equal(object_id, self.opened.object_id):  # buried Gaussians went to still objects
-            self.opened.object_id = object_id
-            self.groups = self._grouped()
+    def _take_run(self, run: Run) -> None:
+        self.refresh_frames()
+        self.poser = Poser(run.gaussians, run.rest, run.binding)
+        self.colliders = tuple(run.colliders().values())
+        self._object_of_particle = np.asarray(run.rows["object"])
+
+    @staticmethod
+    def _frame_dt(run: Run) -> float:
+        return 1 / (run.scene.simulation.fps * run.scene.simulation.slow_motion)
+
+    def _take_splats(self, gaussians: Gaussians, object_id: Int[np.ndarray, "n"]) -> None:
+        """Show these Gaussians at rest."""
+        self.opened.gaussians, self.opened.object_id = gaussians, object_id
+        rest = as_splats(gaussians)
+        factors = np.asarray(rest.factors, np.float64)
+        self.opacities: Float[np.ndarray, "n"] = np.asarray(rest.opacities)
+        self._rest_means = np.asarray(rest.means, np.float32)
+        self._rest_covariances = np.einsum("nij,nkj->nik", factors, factors).astype(np.float32)
+        self._photo = photo_colours(np.asarray(rest.sh))
+        self.kept: Bool[np.ndarray, "n"] = self._most_visible()
+        self.groups = self._grouped()
 
     def _to_rest(self) -> None:
         self._moment = None
@@ -326,14 +328,11 @@ class Session:
             return None
         return strain_of(self._moment.F) if self.look.colour == "strain" else speed_of(self._moment.v)
 
-    def _ids_of_bodies(self) -> list[int]:
-        scene = self.draft.scene()
-        ids = self.opened.inputs(scene).ids
-        return [ids[name] for name, spec in scene.objects.items() if not spec.fixed] or [0]
-
     def dx(self) -> float:
-        """Grid spacing of what is simulated [m]."""
-        return self.live.dx if self.live is not None else self.draft.scene().simulation.dx
+        """Grid spacing of what is simulated [m]; without a simulation a share of the scene."""
+        if self.live is not None:
+            return self.live.dx
+        return self.extent.radius / 24 if self.opened.run is None else self.opened.run.dx
 
     def _most_visible(self) -> Bool[np.ndarray, "n"]:
         """Splats that are finite, and of those the ones of most opacity times area."""
