@@ -1,5 +1,7 @@
 """The logic of `pigjax view` without a browser: opening, picking, posing, colours, scene file, live simulation."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -124,7 +126,7 @@ def test_splats_labels_scenes_and_folders_are_told_apart(folder, tmp_path):
     io.save_labels(tmp_path / "labels.npz", ids, votes, np.ones(len(ids)), np.array([0, 2, 3]), scene=mark)
     labelled = Session(open_path(tmp_path / "c.ply"))
     assert labelled.ids == [2, 3]
-    assert labelled.name_of(3) == "object 3"
+    assert labelled.name_of(3) == "object-3"
     io.save_labels(tmp_path / "labels.npz", ids, votes, np.ones(len(ids)), np.array([0, 2, 3]), scene="other")
     strange = open_path(tmp_path / "c.ply")
     assert set(strange.object_id) == {1}
@@ -253,7 +255,7 @@ def test_frames_of_a_run_are_posed_as_its_video_and_sliders_pose_again(finished)
     state = io.load_state(finished / "states", 3)
     assert session.seconds == pytest.approx(0.1)
     # every Gaussian that has a particle is at it, with the shape of the clamp
-    own = np.asarray(session.plan.particles.gaussian)
+    own = session.opened.run.rows["gaussian"]
     rows = np.flatnonzero(own >= 0)
     np.testing.assert_allclose(session._means[own[rows]], state["x"][rows], atol=1e-6)
     part = Gaussians(
@@ -291,10 +293,10 @@ def test_frames_of_a_run_are_posed_as_its_video_and_sliders_pose_again(finished)
 def test_a_run_with_states_of_other_particles_is_refused(finished, tmp_path):
     session = Session(open_path(finished))
     state = io.load_state(finished / "states", 1)
-    io.save_state(tmp_path, 1, {name: state[name][:5] for name in ("x", "v", "F_visual")}, signature="s")
-    session.opened.states = tmp_path
+    io.save_state(tmp_path / "states", 1, {name: state[name][:5] for name in ("x", "v", "F_visual")}, signature="s")
+    session.opened.run = replace(session.opened.run, folder=tmp_path)
     session.refresh_frames()
-    with pytest.raises(InputError, match="frame 1 has 5 particles, its scene"):
+    with pytest.raises(InputError, match="a state has 5 particles"):
         session.show_frame(1)
 
 
@@ -336,7 +338,7 @@ def test_a_live_simulation_falls_is_dragged_changes_matter_and_goes_back(folder)
 
     session.restart_live()
     assert session.frame == 0
-    np.testing.assert_array_equal(live.particles.x, session.plan.particles.x)
+    np.testing.assert_array_equal(live.particles.x, live.plan.particles.x)
     session.stop_live()
     np.testing.assert_array_equal(session._means, session._rest_means)
 
