@@ -13,21 +13,13 @@ from types import FrameType
 from typing import Any
 
 from pigjax.cli import exporting, objects, printing, scenes, starting, studies  # their commands join the app
-from pigjax.cli.base import app, console, one_device_per_core, said
+from pigjax.cli.base import Stopped, app, console, one_device_per_core, said
 from pigjax.core.errors import InputError, SimulationError
 
 __all__ = ["app", "exporting", "main", "objects", "one_device_per_core", "printing", "scenes", "starting", "studies"]
 
 _STOPPED = "stopped; run the same command again to go on from the last saved state."
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-
-class _Stopped(BaseException):
-    """Ctrl-C or a request to end. No KeyboardInterrupt, which typer answers with an exit of its own."""
-
-    def __init__(self, number: int):
-        super().__init__(number)
-        self.number = number
 
 
 def main() -> None:
@@ -44,9 +36,9 @@ def main() -> None:
     except OSError as error:
         name = "" if error.filename is None else f"{error.filename}: "
         _tell(f"{name}{error.strerror or error}; check the path, its permissions and the room on its disk.", 2)
-    except (_Stopped, KeyboardInterrupt) as error:
+    except (Stopped, KeyboardInterrupt) as error:
         console.print(said(_STOPPED))
-        sys.exit(128 + (error.number if isinstance(error, _Stopped) else signal.SIGINT))
+        sys.exit(128 + (error.number if isinstance(error, Stopped) else signal.SIGINT))
 
 
 def _tell(error: object, code: int) -> None:
@@ -57,7 +49,7 @@ def _tell(error: object, code: int) -> None:
 
 @contextmanager
 def _stoppable() -> Iterator[None]:
-    """Raise `_Stopped` at Ctrl-C and SIGTERM, whatever runs; a second one ends the process without clearing up."""
+    """Raise `Stopped` at Ctrl-C and SIGTERM, whatever runs; a second one ends the process without clearing up."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -68,7 +60,7 @@ def _stoppable() -> Iterator[None]:
         if raised:
             os._exit(128 + number)
         raised.append(number)
-        raise _Stopped(number)
+        raise Stopped(number)
 
     former = {number: signal.getsignal(number) for number in _SIGNALS}
     heeded = [number for number, handler in former.items() if handler is not signal.SIG_IGN]  # not of nohup and "&"

@@ -60,6 +60,14 @@ Origin = Annotated[
 ]
 
 
+class Stopped(BaseException):
+    """Ctrl-C or a request to end. No KeyboardInterrupt, which typer answers with an exit of its own."""
+
+    def __init__(self, number: int):
+        super().__init__(number)
+        self.number = number
+
+
 def output_path(path: str) -> Path:
     """The path that `--out` names: "~" is the home folder; an empty text, as of an unset shell variable, is refused.
 

@@ -20,7 +20,7 @@ def _tell_version(wanted: bool) -> bool:
 
 
 @app.callback()
-def pigjax(
+def every_command(
     version: Annotated[
         bool, typer.Option("--version", help="Print the version.", callback=_tell_version, is_eager=True)
     ] = False,

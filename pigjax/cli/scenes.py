@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from importlib import resources
 from pathlib import Path
 from typing import Annotated
@@ -20,6 +21,7 @@ from pigjax.cli.base import (
     Out,
     Overwrite,
     Quiet,
+    Stopped,
     app,
     console,
     output_path,
@@ -34,10 +36,10 @@ AccuracyOption = Annotated[
     str | None, typer.Option("--accuracy", help="draft, standard or reference, instead of the scene file's.")
 ]
 File = Annotated[
-    Path,
+    Path | None,
     typer.Option(
-        "--out", "-o", help="Video (.mp4, .gif), or one picture (.png).", parser=str,
-        callback=output_path, metavar="PATH",
+        "--out", "-o", help="Write a video (.mp4, .gif) or one picture (.png) instead of opening a page.", parser=str,
+        callback=lambda path: None if path is None else output_path(path), metavar="PATH",
     ),
 ]  # fmt: skip
 
@@ -125,28 +127,38 @@ def _run(
 
 @app.command()
 def view(
-    path: Annotated[Path, typer.Argument(help="A .ply, .splat or .spz.")],
-    out: File = Path("view.mp4"),
-    frames: Annotated[int, typer.Option(help="Frames of one round.", min=1)] = 48,
-    size: Annotated[int, typer.Option(help="Edge of the pictures in pixels.", min=16, max=16384)] = 480,
-    elevation: Annotated[float, typer.Option(help="Of the camera, in degrees.", min=-89, max=89)] = 25.0,
+    path: Annotated[
+        Path, typer.Argument(help="A .ply, .splat or .spz, a scene file, or the folder of a run or of 'segment'.")
+    ],
+    out: File = None,
+    host: Annotated[str, typer.Option(help="Address to listen on; the default is this machine alone.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="First port to try.", min=0, max=65535)] = 8080,
+    browser: Annotated[bool, typer.Option(help="Open the page in a browser.")] = True,
+    splats: Annotated[int, typer.Option(help="Most splats that the page draws.", min=1)] = 250_000,
+    accuracy: AccuracyOption = None,
+    frames: Annotated[int, typer.Option(help="With -o: frames of one round.", min=1)] = 48,
+    size: Annotated[int, typer.Option(help="With -o: edge of the pictures in pixels.", min=16, max=16384)] = 480,
+    elevation: Annotated[float, typer.Option(help="With -o: of the camera, in degrees.", min=-89, max=89)] = 25.0,
     up: Annotated[
         str, typer.Option(help="Axis that points up (x, y, z, -x, -y, -z), three numbers with commas, or auto.")
     ] = "z",
     views: Annotated[
-        Path | None, typer.Option(help="Posed photos of the scene: start in the first of their cameras.")
+        Path | None, typer.Option(help="With -o: posed photos of the scene; start in the first of their cameras.")
     ] = None,
     images: Images = None,
     background: Annotated[
-        float, typer.Option(help="Grey level behind the scene: 0 black, 1 white.", min=0, max=1)
+        float, typer.Option(help="With -o: grey level behind the scene, 0 black, 1 white.", min=0, max=1)
     ] = 1.0,
     drop_invalid: DropInvalid = False,
     origin: Origin = None,
     quiet: Quiet = False,
     no_cache: NoCache = False,
 ) -> None:
-    """Draw a file from all around."""
+    """Open a page to look at splats, a scene or a run, and to simulate it live; with -o draw a file from all around."""
     prepare_jax()
+    if out is None:
+        _open_page(path, host, port, browser, splats, accuracy, up, drop_invalid, origin)
+        return
     from pigjax import io
     from pigjax.cli.turntable import turntable
 
@@ -173,6 +185,45 @@ def _direction(up: str) -> str | tuple[float, float, float]:
         return (float(parts[0]), float(parts[1]), float(parts[2]))
     except ValueError:
         raise InputError(f"--up {up}: give an axis such as -y, three numbers such as 0,0.5,1, or auto.") from None
+
+
+def _open_page(
+    path: Path,
+    host: str,
+    port: int,
+    browser: bool,
+    splats: int,
+    accuracy: str | None,
+    up: str,
+    drop_invalid: bool,
+    origin: tuple[float, float, float] | None,
+) -> None:
+    """Show a page until Ctrl-C."""
+    from pigjax.cli.viewer.opened import open_path
+    from pigjax.cli.viewer.page import Page
+    from pigjax.cli.viewer.server import start_server
+    from pigjax.cli.viewer.session import Session
+
+    server = start_server(host, port)  # before the reading, which may take long: a missing extra is told at once
+    try:
+        opened = open_path(
+            path, accuracy=accuracy, drop_invalid=drop_invalid, origin=origin, up=_direction(up),
+            tell=lambda stage: console.print(said(f"{stage} ...")),
+        )  # fmt: skip
+        page = Page(Session(opened, most=splats), server)
+    except BaseException:
+        server.stop()
+        raise
+    address = f"http://{'localhost' if host == '127.0.0.1' else host}:{server.get_port()}"
+    console.print(said(f"{address} shows {path}; Ctrl-C ends it"))
+    if browser:
+        typer.launch(address)
+    try:
+        while True:
+            time.sleep(3600)
+    except (Stopped, KeyboardInterrupt):
+        page.close()
+        console.print(said("closed"))
 
 
 @app.command()

@@ -268,8 +268,14 @@ def _warn_of_unnamed(inputs: Inputs, found: Int[np.ndarray, "k"]) -> None:
         )
 
 
-def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
+def make_plan(scene: Scene, inputs: Inputs, labels: Labels, *, gaussians_per_cell: int | None = None) -> Plan:
     """Particles, colliders and settings.
+
+    Args:
+        scene: as it was read.
+        inputs: its files.
+        labels: objects of the Gaussians.
+        gaussians_per_cell: most Gaussians that become particles in a lattice cell, as of `seed_particles`.
 
     Raises:
         SceneError: something of the scene cannot be simulated, named by its field.
@@ -292,6 +298,7 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         velocities={inputs.ids[name]: entry.velocity for name, entry in moving.items()},
         spins={inputs.ids[name]: e.angular_velocity for name, e in moving.items() if any(e.angular_velocity)},
         particles_per_cell=spec.particles_per_cell,
+        gaussians_per_cell=gaussians_per_cell,
         colliders=colliders,
         seed=spec.seed,
     )
