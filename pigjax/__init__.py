@@ -13,6 +13,7 @@ from pigjax.core.metrics import boundary_iou, mean_iou, psnr, ssim
 from pigjax.core.placing import as_gaussians, placed
 from pigjax.core.regions import BoxRegion, HalfSpace, SphereRegion
 from pigjax.coupling.binding import at_frame, bind, deform
+from pigjax.coupling.outliers import cut_outliers
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
 from pigjax.io import (
@@ -40,6 +41,7 @@ from pigjax.mpm.timestep import choose_integrator, choose_substeps, stable_dt
 from pigjax.objects.association import Association, associate_masks, compact_ids
 from pigjax.objects.editing import extract_object, hole_mask, remove_object
 from pigjax.objects.evaluation import evaluate_labels
+from pigjax.objects.selection import grow_selection, select_colour, select_part, select_stroke
 from pigjax.reconstruction.prune import contributions, prune
 from pigjax.reconstruction.reconstruct import FitConfig, reconstruct
 from pigjax.scene import Run, RunReport, Scene, export_run, load_run, load_scene, run_scene
@@ -110,6 +112,7 @@ __all__ = [
     "collider_from_gaussians",
     "compact_ids",
     "contributions",
+    "cut_outliers",
     "deform",
     "eigen_clamp",
     "evaluate_labels",
@@ -120,6 +123,7 @@ __all__ = [
     "fit",
     "fit_grid",
     "grab",
+    "grow_selection",
     "hole_mask",
     "interpolate_path",
     "lift_masks",
@@ -155,6 +159,9 @@ __all__ = [
     "save_usd",
     "search",
     "seed_particles",
+    "select_colour",
+    "select_part",
+    "select_stroke",
     "ssim",
     "stable_dt",
     "stack_cameras",

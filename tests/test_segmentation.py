@@ -332,6 +332,7 @@ def load_cloud():
     return Gaussians(*arrays), data["object_id"]
 
 
+@pytest.mark.slow  # the brute force holds votes and winners
 def test_tabletop_gaussians_get_their_true_ids_from_eight_views():
     gaussians, truth = load_cloud()
     views = load_views(ROOT / "examples/tabletop", masks=True, split="train")[::4]

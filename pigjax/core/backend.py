@@ -132,6 +132,7 @@ def launcher(kernel: Any, name: str, outputs: int, in_out: tuple[str, ...] = ())
         call.launch_id = 0
         return call(*arrays, **sizes)
 
+    launch.kernel = kernel  # type: ignore[attr-defined]
     return launch
 
 

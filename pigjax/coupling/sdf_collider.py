@@ -21,7 +21,7 @@ _SMOOTHING = 3  # width of their weights, in distances between samples; trained 
 _MARGIN = 3  # grid samples around the object
 _COARSE = 4  # lattice samples from one that is always computed to the next
 _TOGETHER = 20_000  # points whose neighbours are held at once: 80 MB
-_DEPTH = 16  # grid samples below it: an open surface is solid that deep
+_DEPTH = 16  # grid samples behind it: an open surface is solid that deep
 
 
 @checked
@@ -31,6 +31,7 @@ def collider_from_gaussians(
     spacing: float,
     up: Vector = (0.0, 0.0, 1.0),
     others: Float[np.ndarray, "b 3"] | None = None,
+    eyes: Float[np.ndarray, "e 3"] | None = None,
     friction: float = 0.5,
     mode: str = "separate",
     name: str = "object",
@@ -44,8 +45,10 @@ def collider_from_gaussians(
     Args:
         gaussians: of the object.
         spacing: between samples of the distance, the simulation's dx or finer [m].
-        up: axis of the world that points up; no surface faces down.
+        up: axis of the world that points up; no surface faces down, unless `eyes` saw it from below.
         others: centres of the Gaussians of other objects, which hid parts of the surface [m].
+        eyes: positions of the cameras that saw it [m]: surfaces of any orientation face those that see them. None: not
+            known.
         friction: Coulomb's coefficient; 0.5 is that of many dry solids.
         mode: of `Collider`.
         name: of the object, for messages.
@@ -55,11 +58,12 @@ def collider_from_gaussians(
     """
     shell = shell_of(jax.tree.map(np.asarray, gaussians), name=name)
     above = np.asarray(up, float) / np.linalg.norm(up)
-    points, normals = surface_of(shell, spacing, above, others)
+    points, normals = surface_of(shell, spacing, above, others, eyes)
     if len(points) == 0:
         raise InputError(f"{name}: its Gaussians make no surface, so it cannot be a collider; use a plane or a box.")
-    low = points.min(0) - spacing * (_MARGIN + _DEPTH * np.maximum(above, 0))
-    high = points.max(0) + spacing * (_MARGIN + _DEPTH * np.maximum(-above, 0))
+    behind = above if eyes is None else np.clip(2 * normals.mean(0), -1, 1)
+    low = points.min(0) - spacing * (_MARGIN + _DEPTH * np.maximum(behind, 0))
+    high = points.max(0) + spacing * (_MARGIN + _DEPTH * np.maximum(-behind, 0))
     shape = np.ceil((high - low) / spacing).astype(int) + 1
     width = _SMOOTHING * max(shell.spacing, spacing)
     samples = sampled_distance(points, normals, width, low, spacing, shape)

@@ -55,12 +55,18 @@ def shifted(path: PathLike, positions: Float[np.ndarray, "n 3"], origin: Origin 
 
     Raises:
         InputError: `origin` is no point, or float32 would round half of the points by more than 0.1 mm or 0.1 % of
-            their extent, which another origin prevents.
+            their extent, which another origin prevents, or cannot hold them so far from `origin`.
     """
     start = np.zeros(3) if origin is None else checked_origin(origin)
     local = np.asarray(positions, np.float64) - start
     far = proper_origin(local)
     low, middle, high = np.quantile(local, [0.05, 0.5, 0.95], axis=0) if len(local) else np.zeros((3, 3))
+    if origin is not None and np.abs(middle).max() > np.finfo(np.float32).max:
+        point, near = (", ".join(f"{value:.12g}" for value in place) for place in (start, proper_origin(positions)))
+        raise InputError(
+            f"{path}: origin = ({point}) is subtracted, which leaves numbers too large for float32; coordinates of the"
+            f" file lie around ({near}): give a point near them."
+        )
     extent = (high - low).max()
     rounding = _rounding(local)
     least = min(_COARSE, _COARSE_SHARE * extent) if extent > 0 else _COARSE

@@ -27,7 +27,7 @@ class TransferKernels(NamedTuple):
     scatter_in_order: Any  # (grid, *polynomial, cells, order, start) -> as `scatter`, each node by one thread in order
 
 
-# Grids are read and written by flat index in 16-byte words, which Warp's own vectors are not aligned for.
+# By flat index in words of 16 bytes, to which Warp's own vectors are not aligned.
 _ADD = """
 #if defined(__CUDA_ARCH__)
     SCALAR* at = (SCALAR*)(&grid.data[node]);
@@ -46,6 +46,15 @@ _READ = """
     return wp::vec_t<4, float>(four.x, four.y, four.z, four.w);
 #else
     return grid.data[node];
+#endif
+"""
+
+_LOAD = _READ.replace("grid.", "rows.").replace("node", "at")
+_STORE = """
+#if defined(__CUDA_ARCH__) && FLOAT
+    *(float4*)(&rows.data[at]) = make_float4(value[0], value[1], value[2], value[3]);
+#else
+    rows.data[at] = value;
 #endif
 """
 
@@ -78,6 +87,12 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
 
     @wp.func_native(text(_READ))
     def read(grid: wp.array4d(dtype=vec4), node: int) -> vec4: ...
+
+    @wp.func_native(text(_LOAD))
+    def load(rows: wp.array2d(dtype=vec4), at: int) -> vec4: ...
+
+    @wp.func_native(text(_STORE))
+    def store(rows: wp.array2d(dtype=vec4), at: int, value: vec4): ...
 
     if nodes == 3:
 
@@ -132,7 +147,8 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
         x, y, z = anchor(cell[0], grid.shape[1]), anchor(cell[1], grid.shape[2]), anchor(cell[2], grid.shape[3])
         wx, wy, wz = weights(cell[0] - real(x)), weights(cell[1] - real(y)), weights(cell[2] - real(z))
         node, row, plane = first_node(grid, b, x, y, z), grid.shape[3], grid.shape[2] * grid.shape[3]
-        p0, px, py, pz = constant[b, p], slope_x[b, p], slope_y[b, p], slope_z[b, p]
+        row_of = b * cells.shape[1] + p
+        p0, px, py, pz = load(constant, row_of), load(slope_x, row_of), load(slope_y, row_of), load(slope_z, row_of)
         for i in range(wp.static(nodes)):
             at_x = p0 + real(wp.static(first_offset) + i) * px
             for j in range(wp.static(nodes)):
@@ -152,6 +168,7 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
         x, y, z = anchor(cell[0], grid.shape[1]), anchor(cell[1], grid.shape[2]), anchor(cell[2], grid.shape[3])
         wx, wy, wz = weights(cell[0] - real(x)), weights(cell[1] - real(y)), weights(cell[2] - real(z))
         node, row, plane = first_node(grid, b, x, y, z), grid.shape[3], grid.shape[2] * grid.shape[3]
+        row_of = b * cells.shape[1] + p
         m0, mx, my, mz = vec4(), vec4(), vec4(), vec4()
         for i in range(wp.static(nodes)):
             s0, sy, sz = vec4(), vec4(), vec4()  # of the plane
@@ -167,10 +184,10 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
             mx += (wx[i] * real(wp.static(first_offset) + i)) * s0
             my += wx[i] * sy
             mz += wx[i] * sz
-        constant[b, p] = m0
-        slope_x[b, p] = mx
-        slope_y[b, p] = my
-        slope_z[b, p] = mz
+        store(constant, row_of, m0)
+        store(slope_x, row_of, mx)
+        store(slope_y, row_of, my)
+        store(slope_z, row_of, mz)
 
     @kernel
     def scatter_adjoint(
@@ -185,7 +202,8 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
         dx, dy, dz = cell[0] - real(x), cell[1] - real(y), cell[2] - real(z)
         wx, wy, wz, sx, sy, sz = weights(dx), weights(dy), weights(dz), slopes(dx), slopes(dy), slopes(dz)
         node, row, plane = first_node(grid, b, x, y, z), grid.shape[3], grid.shape[2] * grid.shape[3]
-        q0, qx, qy, qz = p0[b, p], px[b, p], py[b, p], pz[b, p]
+        row_of = b * cells.shape[1] + p
+        q0, qx, qy, qz = load(p0, row_of), load(px, row_of), load(py, row_of), load(pz, row_of)
         m0, mx, my, mz, slope = vec4(), vec4(), vec4(), vec4(), vec3()
         for i in range(wp.static(nodes)):
             at_x = q0 + real(wp.static(first_offset) + i) * qx
@@ -205,10 +223,10 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
                 my += (w * real(wp.static(first_offset) + j)) * r0
                 mz += w * rz
                 slope += vec3(sx[i] * wy[j] * even, wx[i] * sy[j] * even, w * along)
-        constant[b, p] = m0
-        slope_x[b, p] = mx
-        slope_y[b, p] = my
-        slope_z[b, p] = mz
+        store(constant, row_of, m0)
+        store(slope_x, row_of, mx)
+        store(slope_y, row_of, my)
+        store(slope_z, row_of, mz)
         of_cells[b, p] = slope
 
     @kernel
@@ -223,7 +241,8 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
         dx, dy, dz = cell[0] - real(x), cell[1] - real(y), cell[2] - real(z)
         wx, wy, wz, sx, sy, sz = weights(dx), weights(dy), weights(dz), slopes(dx), slopes(dy), slopes(dz)
         node, row, plane = first_node(grid, b, x, y, z), grid.shape[3], grid.shape[2] * grid.shape[3]
-        q0, qx, qy, qz, slope = p0[b, p], px[b, p], py[b, p], pz[b, p], vec3()
+        row_of, slope = b * cells.shape[1] + p, vec3()
+        q0, qx, qy, qz = load(p0, row_of), load(px, row_of), load(py, row_of), load(pz, row_of)
         for i in range(wp.static(nodes)):
             at_x = q0 + real(wp.static(first_offset) + i) * qx
             for j in range(wp.static(nodes)):

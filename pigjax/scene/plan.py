@@ -339,6 +339,7 @@ def _contact(spec: SimulationSpec, bodies: int) -> BodyContact | None:
 
 def _still_solids(scene: Scene, inputs: Inputs, labels: Labels, dx: float) -> dict[str, Collider]:
     object_id = np.asarray(labels.object_id)
+    eyes = None if inputs.views is None else np.asarray(inputs.views.training.cameras.position, np.float64)
     solids: dict[str, Collider] = {}
     for name, entry in scene.objects.items():
         if entry.fixed:
@@ -349,6 +350,7 @@ def _still_solids(scene: Scene, inputs: Inputs, labels: Labels, dx: float) -> di
                 spacing=dx / 2,
                 up=axis_of(scene.input.up),
                 others=np.delete(np.asarray(inputs.gaussians.means), members, axis=0),
+                eyes=None if entry.is_placed else eyes,  # elsewhere they did not see it
                 friction=entry.friction,
                 name=f"objects.{name}",
             )

@@ -110,6 +110,7 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, say: Say, o
         key = io.claim(out / "states", parts, results=results, overwrite=overwrite, signed=io.signed)
     with report.stage("segment"):
         tell("segment", 0, 1)
+        given = scene
         scene, inputs, labels = arrange(scene, inputs, segment(scene, inputs))
         tell("segment", 1, 1)
     with report.stage("seed"):
@@ -127,7 +128,7 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, say: Say, o
         io.save_rows(out / "states", rows_of(plan.particles, labels), signature=key)
         store_colliders(out / COLLIDER_FILE, scene, plan.colliders)
         store_rest(out / REST_FILE, inputs, plan.dx)
-        io.write_toml(out / SCENE_FILE, values_of(scene, out))
+        io.write_toml(out / SCENE_FILE, values_of(given, out))
         tell("seed", 1, 1)
     _describe(scene, inputs, plan, labels, report)
     for remark in plan.remarks:

@@ -315,8 +315,8 @@ class Scene(Section, frozen=True):
     """A whole scene file, one field for each of its tables. Lengths in m, times in s, angles in degrees."""
 
     input: InputSpec  # files
-    simulation: SimulationSpec  # grid, frames, gravity
     objects: dict[str, ObjectSpec]  # by name
+    simulation: SimulationSpec = SimulationSpec()  # grid, frames, gravity
     world: WorldSpec = WorldSpec()  # axes and units of the files
     segmentation: SegmentationSpec = SegmentationSpec()  # thresholds of the vote
     clamp: ClampSpec = ClampSpec()  # bounds and weights of the eigen-clamp

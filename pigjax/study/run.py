@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from msgspec.structs import asdict, replace
 
 from pigjax import io
 from pigjax.core.arguments import checked
+from pigjax.core.checks import shown, suggest
 from pigjax.core.errors import SceneError
 from pigjax.study.experiment import Experiment, Outcome, experiment
 from pigjax.study.objectives import Objective, Scores, check_aim, objective_of
@@ -57,6 +58,7 @@ def sweep_study(
     )
     rows = _rows(study)
     trial, shared = _trial(study, rows, soft=False)
+    _check_shown(study.sweep.of, jax.eval_shape(trial, rows[0], shared))
     table = sweep(
         trial,
         rows,
@@ -221,6 +223,12 @@ def _ends(study: Study, rows: Sequence[Row]) -> list[Row]:
 def _check(made: Experiment | Voting, row: Row) -> None:
     if isinstance(made, Experiment):
         made.with_parameters(row).check()
+
+
+def _check_shown(of: str, scores: Iterable[str]) -> None:
+    """Whether there is a result of that name, before anything is compiled."""
+    if of not in scores:
+        raise SceneError(f"sweep.of = {shown(of)}: the objective gives no such result: {suggest(of, scores)}.")
 
 
 def _bounds(name: str, study: Study) -> Bounds | None:

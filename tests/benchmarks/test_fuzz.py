@@ -3,7 +3,7 @@
 from benchmarks.fuzz import parts as fuzz
 from benchmarks.fuzz.readers import READERS
 
-COUNT = 300  # python -m benchmarks fuzz --count 20000 reads many more
+COUNT = 150  # python -m benchmarks fuzz --count 20000 reads many more
 
 
 def test_every_reader_reads_damaged_files_or_refuses_them():

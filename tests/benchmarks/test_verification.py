@@ -21,7 +21,6 @@ from pigjax.mpm.materials import Material, material_table
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_fixed_free_bar_swings_with_its_period_to_first_order_of_its_wall(x64):
     """T = 4 L/c: 2.1 % at 10 cells and 1.0 % at 20, all of it the wall's: the free bar has a fourth of it."""
     coarse, fine = (period(cells, "fixed") - 1 for cells in (10, 20))
@@ -48,6 +47,7 @@ def test_manufactured_motion_of_a_cube_between_walls_converges_with_first_order(
     assert math.log2(coarse / fine) > 0.9
 
 
+@pytest.mark.slow  # test_mls_mpm.py holds the order of a swinging bar
 def test_generalised_vortex_turns_to_and_fro():
     """A = 0.1 with 8 cells across the ring: 3.0 % of the amplitude."""
     error, *_ = vortex_error(8, 0.1, per_side=3)
@@ -65,6 +65,7 @@ def test_generalised_vortex_converges_with_second_order(amplitude, bound):
     assert math.log2(coarse / fine) > 1.8
 
 
+@pytest.mark.slow  # the same discs rebound with contact below
 def test_two_discs_rebound():
     """At 1/20 m they meet 1.6 cells early, part at 0.83 of their speed, and keep 71 % of the energy; at 1/80 94 %."""
     t, moving, stored, approach, drift = discs(20)
@@ -139,6 +140,7 @@ def test_block_between_plates_has_its_modulus(x64, axes, cells, bound):
     assert ours == pytest.approx(exact, rel=bound)
 
 
+@pytest.mark.slow  # test_mls_mpm.py holds the sag of a column
 def test_cantilever_sags_by_timoshenkos_closed_form(x64):
     """3.5 % at 4 cells of thickness: of 32 cells of length the wall adds a quarter, to the fourth power."""
     mean, swing, *_ = sag(4)
@@ -147,7 +149,8 @@ def test_cantilever_sags_by_timoshenkos_closed_form(x64):
     assert swing == pytest.approx(1, abs=0.035)
 
 
-@pytest.mark.parametrize("kernel", ["quadratic", pytest.param("cubic", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
+@pytest.mark.slow  # test_mls_mpm.py holds the angular momentum of 200 steps
 def test_turning_block_keeps_its_angular_momentum_and_nearly_its_energy(x64, kernel):
     """After half a turn less than 0.3 % of the energy is gone, which is what a whole turn takes."""
     energy, drift = turning(kernel, turns=0.5)
@@ -193,7 +196,7 @@ def classic_step(x, v, C, F, mass, volume, table, dx, dt):
     return x + dt * new_v, new_v, new_C, F + dt * gradient @ F
 
 
-@pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
+@pytest.mark.parametrize("kernel", ["quadratic", pytest.param("cubic", marks=pytest.mark.slow)])
 def test_plain_step_of_mls_mpm_is_the_librarys(x64, kernel):
     """What the classic force is compared with computes what users get."""
     rng, dt = np.random.default_rng(0), 1e-3

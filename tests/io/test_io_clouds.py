@@ -92,6 +92,8 @@ def test_far_doubles_are_refused_or_shifted_and_restored(tmp_path, text):
     with pytest.raises(InputError, match=r"around \(450000, 5400000, 0\).*origin=\(450000, 5400000, 0\)"):
         load_gaussians(path)
     origin = origin_of(path)
+    with pytest.raises(InputError, match=r"origin = \(1e\+300, 0, 0\) is subtracted.*around \(450000, 5400000, 0\)"):
+        load_gaussians(path, origin=(1e300, 0.0, 0.0))
     gaussians = load_gaussians(path, origin=origin)
     np.testing.assert_allclose(np.asarray(gaussians.means, np.float64) + origin, positions, atol=1e-4)
     save_ply(tmp_path / "b.ply", gaussians, origin=origin)

@@ -64,7 +64,7 @@ def moving_cube(table):
     return eqx.tree_at(lambda p: p.F, p, p.F * jnp.asarray([0.97, 1.02, 1.0]))
 
 
-@pytest.mark.parametrize("model", ["neo_hookean", "fixed_corotated"])
+@pytest.mark.parametrize("model", ["neo_hookean", pytest.param("fixed_corotated", marks=pytest.mark.slow)])
 def test_200_steps_conserve_mass_and_linear_and_angular_momentum(x64, model):
     table = table_of(model)
     start = moving_cube(table)
@@ -129,7 +129,7 @@ def test_result_does_not_depend_on_the_chunks(x64):
     table = table_of()
     start = moving_cube(table)
     one, *_ = step(start, grid(), table, SimConfig(), 1e-4, gravity=NO_GRAVITY)
-    for chunk in (1, 7, 64):
+    for chunk in (1, 7):
         other, *_ = step(start, grid(), table, SimConfig(chunk=chunk), 1e-4, gravity=NO_GRAVITY)
         for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other)):
             np.testing.assert_allclose(a, b, atol=1e-13)

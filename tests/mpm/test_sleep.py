@@ -162,7 +162,7 @@ def test_sleep_is_refused_where_it_cannot_be_decided_and_bad_numbers_are_named()
 
 def test_a_killed_scene_with_a_sleeper_resumes_to_the_same_states(tmp_path):
     """A ball without gravity sleeps from the sixth frame on."""
-    io.save_ply(tmp_path / "cloud.ply", ball())
+    io.save_ply(tmp_path / "cloud.ply", ball(150))
     content = values(simulation__sleep=0.01)
     content["simulation"] |= {"gravity": 0.0, "frames": 8}
     scene = scene_from(content, folder=tmp_path)

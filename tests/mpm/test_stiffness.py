@@ -1,6 +1,7 @@
 """Derivatives of grid forces against those by JAX of the forces themselves, and what preconditions their solves."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -45,9 +46,9 @@ def matter(laws, kernel="quadratic", *, strain=0.1):
 def test_kept_derivatives_of_forces_are_those_of_the_forces(law, x64):
     statics, context, states, v = matter([law])
     change = jnp.asarray(np.random.default_rng(1).normal(size=v.shape))
-    found = tangents(statics, context, states, v)(change)
-    step = 1e-6
-    ends = [forces(statics, context, states, v + sign * step * change) for sign in (1, -1)]
+    found = jax.jit(lambda v: tangents(statics, context, states, v)(change))(v)
+    felt, step = jax.jit(lambda v: forces(statics, context, states, v)), 1e-6
+    ends = [felt(v + sign * step * change) for sign in (1, -1)]
     expected = (ends[0] - ends[1]) / (2 * step)
     assert float(jnp.abs(expected).max()) > 1
     np.testing.assert_allclose(found, expected, atol=1e-6 * float(jnp.abs(expected).max()))
@@ -70,7 +71,7 @@ def test_the_diagonal_of_the_stiffness_is_that_of_pressure_waves_at_rest(kernel,
 
 def test_masses_are_told_apart_by_material(x64):
     statics, context, states, _ = matter(["neo_hookean", "fluid", "neo_hookean"])
-    found = masses(statics, context, states)
+    found = jax.jit(lambda states: masses(statics, context, states))(states)
     assert found.shape == (*GRID.shape, 3)
     # 40 particles of 0.1 kg, dealt out in turn; rows of one law stand together
     np.testing.assert_allclose(found.sum((0, 1, 2)), [1.4, 1.3, 1.3], rtol=1e-12)

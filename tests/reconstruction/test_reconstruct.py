@@ -193,7 +193,6 @@ def test_masks_fit_one_object_and_leave_the_rest_out(views, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_pose_refinement_takes_back_a_shifted_camera(views):
     loaded, points = views
     train = [k for k, split in enumerate(loaded.splits) if split == "train"]
@@ -250,17 +249,17 @@ def as_colmap(views, folder):
 @pytest.mark.parametrize("write", [pytest.param(as_inria, marks=pytest.mark.slow), as_colmap])
 def test_every_kind_of_capture_gives_the_same_reconstruction(tmp_path, write):
     """Real photos, their cameras said once as nerfstudio's and once as another format."""
-    truth = io.load_views(TABLETOP, max_size=64, background=1.0)
+    truth = io.load_views(TABLETOP, max_size=40, background=1.0)
     write(io.load_views(TABLETOP), tmp_path)
     (tmp_path / "images").symlink_to(TABLETOP / "images")
-    other = io.load_views(tmp_path, max_size=64, background=1.0)
+    other = io.load_views(tmp_path, max_size=40, background=1.0)
     assert other.names == truth.names
-    config = FitConfig(steps=50, splats=1500, sh_degree=0, background=1.0, noise=0.0, relocate_every=0)
+    config = FitConfig(steps=40, splats=800, sh_degree=0, background=1.0, noise=0.0, relocate_every=0)
     points = io.load_points(TABLETOP / "sparse_pc.ply")
     ours = reconstruct(replace(other, splits=truth.splits), config, points=points)
     expected = reconstruct(truth, config, points=points)
     print(f"{write.__name__}: {ours.mean_psnr:.2f} dB, nerfstudio {expected.mean_psnr:.2f} dB")
-    assert expected.mean_psnr > 16
+    assert expected.mean_psnr > 15
     assert abs(ours.mean_psnr - expected.mean_psnr) < 0.1
 
 

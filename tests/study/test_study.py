@@ -289,6 +289,7 @@ BAD = {
         {"parameters": {"segmentation.tau_T": {"values": [0.5]}, "clamp.lambda_R": {"values": [1.0]}}},
         "study them apart",
     ),
+    "unknown result": ({"sweep": {"of": "ball.zz"}}, r"sweep.of = 'ball.zz': .*did you mean 'ball.z'"),
     "no target": ({"objective": {"function": "video"}}, "target is missing"),
 }
 
@@ -364,6 +365,7 @@ def test_votes_are_scored_by_the_held_out_masks():
         vote.with_parameters({"segmentation.tau_t": 0.5})
 
 
+@pytest.mark.slow  # test_segmentation.py holds the gradient of votes
 def test_soft_votes_have_a_slope(x64):
     vote = jax.tree.map(
         lambda a: a.astype(float) if jnp.issubdtype(a.dtype, jnp.floating) else a, voters(jnp.asarray(0.02))
