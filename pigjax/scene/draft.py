@@ -317,7 +317,7 @@ def _mark_supports(parts: list[Part]) -> None:
             over += inside and abs(foot - part.high[2]) < max(0.5 * tall, 1e-9) and foot > part.low[2]
         named = re.sub(r"[\W_0-9]+", " ", part.name.lower()).split()
         carries = len(others) > 1 and 2 * over >= len(others)
-        part.fixed = carries or (bool(others) and any(word in _SUPPORTS for word in named))
+        part.fixed = bool(carries or (others and any(word in _SUPPORTS for word in named)))
     if all(part.fixed for part in parts):
         max(parts, key=lambda part: float(part.high[2])).fixed = False
 
