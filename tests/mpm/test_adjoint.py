@@ -186,8 +186,11 @@ def test_integers_of_the_state_pass(x64):
         after, own = end(shared, state, between, state["count"])
         return after | {"count": state["count"] + 1}, own
 
+    def counted(shared, state, number):
+        return begin(shared, state, state["count"])
+
     shared, state = inputs()
-    own = steps(7, 3, False)._replace(end=counting, passive={"x": False, "weight": True, "count": False})
+    own = steps(7, 3, False)._replace(begin=counted, end=counting, passive={"x": False, "weight": True, "count": False})
 
     def ours(shared, state):
         return run_steps(own, shared, state | {"count": jnp.int32(2)}, jnp.int32(0))
