@@ -6,11 +6,14 @@ Pipeline: files (`io`) → Gaussians (`reconstruction`, or a trained file) → o
 """
 
 from pigjax.clamp import ClampParams, eigen_clamp
+from pigjax.core import __version__ as __version__
 from pigjax.core.camera import Camera, interpolate_path, look_at, orbit, stack_cameras
 from pigjax.core.errors import InputError, MissingFileError, SceneError, SimulationError
 from pigjax.core.metrics import boundary_iou, mean_iou, psnr, ssim
+from pigjax.core.placing import as_gaussians, placed
 from pigjax.core.regions import BoxRegion, HalfSpace, SphereRegion
 from pigjax.coupling.binding import at_frame, bind, deform
+from pigjax.coupling.outliers import cut_outliers
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
 from pigjax.io import (
@@ -22,7 +25,9 @@ from pigjax.io import (
     load_points,
     load_views,
     origin_of,
+    save_glb,
     save_ply,
+    save_usd,
     write_video,
 )
 from pigjax.mls_mpm import SimConfig, rollout, step
@@ -36,9 +41,10 @@ from pigjax.mpm.timestep import choose_integrator, choose_substeps, stable_dt
 from pigjax.objects.association import Association, associate_masks, compact_ids
 from pigjax.objects.editing import extract_object, hole_mask, remove_object
 from pigjax.objects.evaluation import evaluate_labels
+from pigjax.objects.selection import grow_selection, select_colour, select_part, select_stroke
 from pigjax.reconstruction.prune import contributions, prune
 from pigjax.reconstruction.reconstruct import FitConfig, reconstruct
-from pigjax.scene import RunReport, Scene, load_scene, run_scene
+from pigjax.scene import Run, RunReport, Scene, export_run, load_run, load_scene, run_scene
 from pigjax.segmentation import Labels, fill_unseen, lift_masks, object_mask
 from pigjax.splat import (
     Frame,
@@ -51,9 +57,6 @@ from pigjax.splat import (
 )
 from pigjax.study import Experiment, experiment, load_study, sweep_study, tune_study
 from pigjax.study.optimize import Bounds, Table, fit, load_table, search, sweep
-
-__version__ = "0.1.0"
-
 
 __all__ = [
     "Association",
@@ -83,6 +86,7 @@ __all__ = [
     "Particles",
     "Plane",
     "RenderConfig",
+    "Run",
     "RunReport",
     "SampledDistance",
     "Scene",
@@ -98,6 +102,7 @@ __all__ = [
     "Trajectory",
     "Views",
     "Wind",
+    "as_gaussians",
     "associate_masks",
     "at_frame",
     "bind",
@@ -107,15 +112,18 @@ __all__ = [
     "collider_from_gaussians",
     "compact_ids",
     "contributions",
+    "cut_outliers",
     "deform",
     "eigen_clamp",
     "evaluate_labels",
     "experiment",
+    "export_run",
     "extract_object",
     "fill_unseen",
     "fit",
     "fit_grid",
     "grab",
+    "grow_selection",
     "hole_mask",
     "interpolate_path",
     "lift_masks",
@@ -124,6 +132,7 @@ __all__ = [
     "load_masks",
     "load_ply",
     "load_points",
+    "load_run",
     "load_scene",
     "load_study",
     "load_table",
@@ -135,6 +144,7 @@ __all__ = [
     "object_mask",
     "orbit",
     "origin_of",
+    "placed",
     "preset",
     "prune",
     "psnr",
@@ -144,9 +154,14 @@ __all__ = [
     "required_capacity",
     "rollout",
     "run_scene",
+    "save_glb",
     "save_ply",
+    "save_usd",
     "search",
     "seed_particles",
+    "select_colour",
+    "select_part",
+    "select_stroke",
     "ssim",
     "stable_dt",
     "stack_cameras",

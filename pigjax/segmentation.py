@@ -29,6 +29,7 @@ from pigjax.splatting.projection import near_plane, project_splats
 from pigjax.splatting.scan_compositor import static_capacity
 from pigjax.splatting.types import as_splats
 
+_NO_ID = -1  # of a pixel that does not count
 _TIED_IDS = 4  # of more ids with equal votes, the lowest four compete
 _MOST_MEMORY = 2**35  # [bytes] of votes; more come from ids that number annotations rather than objects
 _IDS_TOGETHER = 32  # ids drawn or credited in one pass, which bounds the memory
@@ -60,6 +61,7 @@ def lift_masks(
     min_votes: Scalar | int = 1,
     purity: Scalar = 0.0,
     min_seen: Scalar | None = None,
+    valid: Bool[Array | np.ndarray, "t h w"] | None = None,
     config: RenderConfig = RenderConfig(),
 ) -> Labels:
     """Give every Gaussian the id that most views see at its position (PIG, section 3.2).
@@ -96,6 +98,8 @@ def lift_masks(
         min_seen: with weighting = "alpha", a Gaussian whose alpha·T is a smaller share than this of the alpha of its
             whole footprints stays unseen, id -1: nearly all of it is hidden, so it may extend through a surface.
             None, the default, tests nothing; 0.05 with purity = 0.6 gives objects without fringes.
+        valid: pixels that count (`Views.valid`): a Gaussian in another pixel has no vote and no credit there. None, the
+            default, counts all, and traces nothing.
         config: the renderer's settings.
 
     Raises:
@@ -104,6 +108,10 @@ def lift_masks(
     """
     check_masks(cameras, masks)
     _check_ids(masks, num_ids, len(gaussians), len(cameras))
+    if valid is not None and valid.shape != masks.shape:
+        raise InputError(
+            f"valid has shape {tuple(valid.shape)}, the masks have {tuple(masks.shape)}: one for each pixel."
+        )
     _check_choice("background", background, ("ignore", "vote"))
     _check_choice("weighting", weighting, ("centre", "alpha"))
     _check_choice("ties", ties, ("alpha", "lowest"))
@@ -122,9 +130,12 @@ def lift_masks(
     thresholds = jnp.asarray(tau_T, dtype), jnp.asarray(tau_d, dtype), temperature
     settled = weighting == "centre" and temperature is None and ties == "alpha"
     splats, masks, cameras = as_splats(gaussians), jnp.asarray(masks), in_precision(cameras, dtype)
+    if valid is not None:
+        # an id of no column: nothing matches it, and it casts no vote
+        masks = jnp.where(jnp.asarray(valid), masks.astype(jnp.int32), _NO_ID)
     scanned = enough_capacity(gaussians, cameras, config) if settled or temperature is not None else config
     drawn = config if temperature is None else scanned
-    votes, overflow = _collect(splats, cameras, masks, thresholds, num_ids, weighting, drawn)
+    votes, overflow = _collect(splats, cameras, masks, thresholds, num_ids, weighting, drawn, valid is not None)
     if settled and scanned is config:
         overflow += _left_out(splats, cameras, scanned)
     break_ties = jax.tree_util.Partial(_credit_candidates, splats, cameras, masks, scanned)
@@ -275,8 +286,8 @@ def enough_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: Rend
 
 
 @eqx.filter_jit
-def _collect(splats, cameras, masks, thresholds, num_ids, weighting, config):
-    """Votes [n m] of all views, and the splat/tile pairs that the renderer dropped."""
+def _collect(splats, cameras, masks, thresholds, num_ids, weighting, config, partial):
+    """Votes [n m] of all views, and the splat/tile pairs that the renderer dropped; `partial`: masks have gaps."""
     tau_T, tau_d, temperature = thresholds
     if weighting == "alpha":
         dtype = splats.means.dtype
@@ -290,7 +301,8 @@ def _collect(splats, cameras, masks, thresholds, num_ids, weighting, config):
 
         def count(votes, camera, mask):
             pixel, seen, overflow = on_surface(splats, camera, tau_T, tau_d, config)
-            return _cast(votes, mask.ravel()[pixel], seen), overflow
+            ids = mask.ravel()[pixel]
+            return _cast(votes, ids, seen & (ids != _NO_ID) if partial else seen), overflow
 
     else:
         dtype = splats.means.dtype
@@ -298,7 +310,8 @@ def _collect(splats, cameras, masks, thresholds, num_ids, weighting, config):
         def count(votes, camera, mask):
             weigh = jax.checkpoint(lambda camera: _soft_votes(splats, camera, tau_T, tau_d, temperature, config))
             pixel, weight, overflow = weigh(camera)
-            return _cast(votes, mask.ravel()[pixel], weight), overflow
+            ids = mask.ravel()[pixel]
+            return _cast(votes, ids, jnp.where(ids != _NO_ID, weight, 0.0) if partial else weight), overflow
 
     def one_view(carry, view):
         votes, overflow = count(carry[0], *view)

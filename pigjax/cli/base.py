@@ -50,6 +50,10 @@ Changes = Annotated[
         "--set", metavar="FIELD=VALUE", help="Replace a field of the file: --set simulation.frames=8; repeat it."
     ),
 ]
+Images = Annotated[
+    Path | None,
+    typer.Option("--images", metavar="DIR", help="Folder of the photos, if not the one that the cameras' file names."),
+]
 Origin = Annotated[
     tuple[float, float, float] | None,
     typer.Option("--origin", metavar="X Y Z", help="Subtract this point, for georeferenced files [m]."),

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pigjax.core.backend import backend_in_use
 from pigjax.mls_mpm import SimConfig, step
 from pigjax.mpm import fit_grid, make_particles
 from pigjax.mpm.materials import material_table, preset
@@ -36,6 +37,7 @@ def findings() -> tuple[list[str], list[str]]:
         f"pigjax: {_version('pigjax')}, Python {platform.python_version()}, {platform.platform()}",
         f"jax: {jax.__version__}, jaxlib {_version('jaxlib')}{_fault_of_jax(faults)}",
         *_devices(),
+        f"kernels: {backend_in_use()}",
         f"memory: {_memory()}",
         f"cores: {len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()} usable",
         f"disk: {shutil.disk_usage('.').free / 1e9:.0f} GB free here",

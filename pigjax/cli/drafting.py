@@ -26,24 +26,20 @@ def write_draft(found: Found, folder: Path, *, up: str | None, ask: Callable[[st
     Raises:
         InputError: as `draft_scene`, or a file cannot be written.
     """
-    if found.gaussians is None:
+    if (splats := found.gaussians) is None:
         raise InputError("a draft needs trained splats.")
 
-    def drafted(up: str | None):
+    def drafted(up: str | None) -> Draft:
         return draft_scene(
-            found.gaussians, folder, views_path=found.views, masks_path=found.masks, names_path=found.names, up=up
+            splats, folder, views_path=found.views, masks_path=found.masks, names_path=found.names, up=up
         )
 
-    draft, gaussians, views = drafted(up)
+    draft = drafted(up)
     if ask is not None and (answer := ask(draft.up)) != draft.up:
-        draft, gaussians, views = drafted(answer)
-    if draft.labels is not None:
-        labels = draft.labels
-        io.save_labels(
-            folder / "labels.npz", labels.object_id, labels.votes, labels.confidence,
-            scene=io.digest_of_scene(gaussians),
-        )  # fmt: skip
-    for name, picture in thumbnails(gaussians, draft.parts, views, draft.up).items():
+        draft = drafted(answer)
+    if (labels := draft.labels) is not None:
+        io.save_labels(folder / "labels.npz", labels.object_id, labels.votes, labels.confidence, scene=draft.mark)
+    for name, picture in thumbnails(draft).items():
         io.write_image(folder / "thumbnails" / f"{io.safe_name(name)}.png", picture)
     io.write_text(folder / "scene.toml", draft.text)
     return draft

@@ -107,7 +107,7 @@ def evaluate_files(
 def _lift(gaussians: Gaussians, dataset: io.Dataset, **settings: Any) -> Labels:
     if dataset.masks is None or dataset.cameras is None:
         raise InputError("the data set was read without masks that vote; give labels.npz, or read it with vote=True.")
-    return lift(gaussians, dataset.cameras, dataset.masks, **settings)
+    return lift(gaussians, dataset.cameras, dataset.masks, valid=dataset.valid, **settings)
 
 
 def _grounding(

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from pigjax.cli.base import (
     DropInvalid,
+    Images,
     NoCache,
     Origin,
     Out,
@@ -25,6 +26,7 @@ from pigjax.cli.base import (
     row,
     said,
 )
+from pigjax.core.errors import InputError
 
 TauT = Annotated[float, typer.Option(help="Transmittance that marks the surface.", min=0, max=1)]
 TauD = Annotated[float, typer.Option(help="Relative depth tolerance of a vote.", min=0, max=1)]
@@ -55,6 +57,7 @@ def reconstruct(
     sh_degree: Annotated[int, typer.Option(help="Bands of view-dependent colour.", min=0, max=3)] = 1,
     background: Annotated[float, typer.Option(help="Grey level behind the scene: 0 black, 1 white.")] = 0.0,
     max_size: Annotated[int | None, typer.Option(help="Shrink photos to this many pixels.")] = None,
+    images: Images = None,
     start_splats: Annotated[
         int | None, typer.Option(help="Begin with fewer Gaussians and double them during the first half.", min=4)
     ] = None,
@@ -80,7 +83,13 @@ def reconstruct(
     needs_masks = only is not None or random_background
     doublings = max(math.ceil(math.log2(splats / start_splats)), 1) if start_splats else 1
     loaded = io.load_views(
-        views, masks=needs_masks, missing_masks="abstain", max_size=max_size, background=background, origin=origin
+        views,
+        images=images,
+        masks=needs_masks,
+        missing_masks="abstain",
+        max_size=max_size,
+        background=background,
+        origin=origin,
     )
     points = io.load_points(loaded.points_path, origin=origin) if loaded.points_path else None
     config = FitConfig(
@@ -151,8 +160,11 @@ def _settings(tau_t: float, tau_d: float, weighting: str, purity: float, min_see
 @app.command()
 def segment(
     gaussians: Annotated[Path, typer.Argument(help="Trained .ply, .splat or .spz.")],
-    views: Annotated[Path, typer.Argument(help="Posed photos with a folder object_mask beside them.")],
+    views: Annotated[
+        Path | None, typer.Argument(help="Posed photos with a folder object_mask beside them; not needed by --select.")
+    ] = None,
     out: Out = Path("segments"),
+    images: Images = None,
     masks: Annotated[Path | None, typer.Option(help="Folder of masks, if it lies elsewhere.")] = None,
     names: Annotated[Path | None, typer.Option(help="JSON of mask ids and names.")] = None,
     tau_t: TauT = 0.5,
@@ -161,6 +173,18 @@ def segment(
     purity: Purity = 0.0,
     min_seen: MinSeen = None,
     fill: Fill = True,
+    associate: Annotated[
+        bool, typer.Option("--associate", help="Masks have ids of their own in each view: link those of one object.")
+    ] = False,
+    select: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=CRITERIA",
+            help="Choose an object without masks: box X Y Z X Y Z, sphere X Y Z R, half-space X Y Z NX NY NZ, below H,"
+            " above H, colour R G B TOLERANCE, part X Y Z, stroke PICTURE VIEW, rest; joined by '&'. Repeat it.",
+        ),
+    ] = None,
+    up: Annotated[str, typer.Option(help="Axis that points up, for below and above.")] = "z",
     remove: Annotated[list[str] | None, typer.Option(help="Object to leave out, by name or id; repeat it.")] = None,
     drop_invalid: DropInvalid = False,
     origin: Origin = None,
@@ -170,21 +194,40 @@ def segment(
 ) -> None:
     """Lift masks to the Gaussians; writes labels, one .ply per object, and a sheet that shows which id is which.
 
-    With --remove also the scene without an object, and the hole that it leaves in every view.
+    With --remove also the scene without an object, and the hole that it leaves in every view. With --select objects are
+    chosen by place, colour or a stroke painted in a photo instead of masks; a scene reads them by input.labels.
     """
     from pigjax import io
     from pigjax.cli.segmenting import segment_files
+    from pigjax.cli.selecting import select_files
 
+    if select and (masks is not None or associate or remove):
+        raise InputError("--select chooses without masks; give it without --masks, --associate and --remove.")
+    if views is None and not select:
+        raise InputError("posed photos are missing: name them after the Gaussians, or choose objects by --select.")
     cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid, origin=origin)
-    loaded = io.load_views(views, masks=masks if masks is not None else True, missing_masks="abstain", origin=origin)
+    if select:
+        photos = None if views is None else io.load_views(views, images=images, origin=origin)
+        chosen, numbers = select_files(cloud, select, out, views=photos, up=up, origin=origin, overwrite=overwrite)
+        _tell_objects(numbers, {0: "the rest", **chosen}, out)
+        return
+    assert views is not None
+    loaded = io.load_views(
+        views, images=images, masks=masks if masks is not None else True, missing_masks="abstain", origin=origin
+    )
     known = {} if names is None else io.load_names(names)
     settings = _settings(tau_t, tau_d, weighting, purity, min_seen)
     counts = segment_files(
-        cloud, loaded, known, out, fill=fill, remove=remove or (), origin=origin, overwrite=overwrite, **settings
-    )
+        cloud, loaded, known, out, fill=fill, remove=remove or (), associate=associate, origin=origin,
+        overwrite=overwrite, **settings,
+    )  # fmt: skip
+    _tell_objects(counts, {-1: "never seen", **known}, out)
+
+
+def _tell_objects(counts: dict[int, int], names: dict[int, str], out: Path) -> None:
     table = Table("id", "object", "Gaussians")
     for number, count in counts.items():
-        table.add_row(*row(number, known.get(number, "never seen" if number < 0 else ""), count))
+        table.add_row(*row(number, names.get(number, ""), count))
     console.print(table)
     console.print(said(f"written to {out}"))
 
@@ -195,6 +238,7 @@ def evaluate(
     gaussians: Annotated[Path, typer.Argument(help="Trained .ply, .splat or .spz of it.")],
     layout: Annotated[str, typer.Option("--format", help="lerf-mask, 3d-ovs, or views.")],
     out: Out = Path("evaluation"),
+    images: Images = None,
     masks: Annotated[Path | None, typer.Option(help="Folder or JSON of the masks to lift, if not object_mask.")] = None,
     labels: Annotated[Path | None, typer.Option(help="labels.npz of 'pigjax segment', instead of lifting.")] = None,
     prompts: Annotated[Path | None, typer.Option(help="JSON {prompt: id}.")] = None,
@@ -219,7 +263,7 @@ def evaluate(
 
     cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid, origin=origin)
     read = io.load_dataset(
-        dataset, layout, masks=masks, vote=labels is None, max_size=max_size, holes=holes, origin=origin
+        dataset, layout, images=images, masks=masks, vote=labels is None, max_size=max_size, holes=holes, origin=origin
     )
     with progress() as bar:
         tasks: dict[str, TaskID] = {}

@@ -12,7 +12,7 @@ from pigjax.cli.base import answers, app, console, row, said
 
 def _tell_version(wanted: bool) -> bool:
     if wanted:
-        from pigjax import __version__
+        from pigjax.core import __version__
 
         answers.print(said(f"pigjax {__version__}"))
         raise typer.Exit

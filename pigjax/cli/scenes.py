@@ -96,13 +96,18 @@ def _run(
         scene = structs.replace(scene, input=structs.replace(scene.input, drop_invalid=True))
     with progress() as bar:
         tasks: dict[str, TaskID] = {}
+        told: list[str] = []
 
         def tell(stage: str, done: int, of: int) -> None:
             if stage not in tasks:
                 tasks[stage] = bar.add_task(stage, total=of)
             bar.update(tasks[stage], completed=done, total=of)
 
-        report = run_scene(scene, out, progress=tell, overwrite=overwrite)
+        def say(line: str) -> None:
+            told.append(line)
+            console.print(said(line), soft_wrap=True)
+
+        report = run_scene(scene, out, progress=tell, say=say, overwrite=overwrite)
     table = Table("stage", "run s", "compile s")
     for name, spent in report.times.items():
         table.add_row(*row(name, f"{spent.run:.1f}", f"{spent.compile:.1f}"))
@@ -112,7 +117,7 @@ def _run(
         f"{sizes['gaussians']} Gaussians, {sizes['particles']} particles of {', '.join(report.modelled['laws'])};"
         f" {sizes['frames']} frames of {sizes['substeps_per_frame']} substeps"
     )
-    for warning in report.warnings:
+    for warning in (w for w in report.warnings if f"note: {w}" not in told):
         console.print(said(warning, label="note: ", style="yellow"))
     console.print(said(f"video: {report.files['video']}"))
 

@@ -16,7 +16,9 @@ from pigjax import io
 from pigjax.core.checks import suggest
 from pigjax.core.errors import InputError
 from pigjax.core.gaussians import SH_CONSTANT
+from pigjax.core.harmonics import sh_degree_of
 from pigjax.io.files import existing
+from pigjax.objects.association import associate_masks
 from pigjax.objects.editing import extract_object, hole_mask, remove_object
 from pigjax.objects.lifting import lift
 from pigjax.objects.overlay import colours_of, legend_sheet, overlay
@@ -24,7 +26,6 @@ from pigjax.reconstruction.prune import contributions
 from pigjax.scene.schema import load_scene
 from pigjax.segmentation import Labels, pixel_ids
 from pigjax.splat import Gaussians, render
-from pigjax.splatting.sh import sh_degree_of
 from pigjax.splatting.types import extent_of
 
 _SHEET_VIEWS = 4
@@ -40,6 +41,7 @@ def segment_files(
     *,
     fill: bool,
     remove: Sequence[str] = (),
+    associate: bool = False,
     origin: tuple[float, float, float] | None = None,
     overwrite: bool = False,
     **settings: Any,
@@ -58,6 +60,8 @@ def segment_files(
         out: folder, made if it is missing.
         fill: give unseen Gaussians the id of their neighbours.
         remove: names or ids of objects.
+        associate: link masks whose ids mean something else in every view (`associate_masks`); object 1 is then the one
+            that is seen most.
         origin: offset subtracted from the scene's positions [m], added again in the files; None: none.
         overwrite: remove results in `out` of other Gaussians, views, masks, names or settings, instead of refusing it.
         settings: of `lift_masks`.
@@ -77,9 +81,9 @@ def segment_files(
             "Gaussians": io.digest(gaussians),
             "cameras": io.digest(views.cameras),
             "photos": io.digest(views.images, views.names, views.splits),
-            "masks": io.digest(views.masks),
+            "masks": io.digest(views.masks) if views.valid is None else io.digest(views.masks, views.valid),
             "names": io.digest(names),
-            "": {**settings, "fill": fill, "origin": origin},
+            "": {**settings, "fill": fill, "origin": origin, **({"associate": True} if associate else {})},
         }
     )
     results = ("labels.npz", "coloured.ply", "objects.png", "objects", "removed")
@@ -87,7 +91,11 @@ def segment_files(
     io.output_folder(out / "objects")
     train = views.voters
     assert train.masks is not None
-    labels = lift(gaussians, train.cameras, train.masks, fill=fill, **settings)
+    masks = train.masks
+    if associate:
+        tolerances = {name: settings[name] for name in ("tau_T", "tau_d") if name in settings}
+        masks = associate_masks(gaussians, train.cameras, masks, **tolerances).masks
+    labels = lift(gaussians, train.cameras, masks, fill=fill, valid=train.valid, **settings)
     object_id = np.asarray(labels.object_id)
     mark = io.digest_of_scene(gaussians) if origin is None else None  # else positions are not those of the file
     io.save_labels(out / "labels.npz", object_id, labels.votes, labels.confidence, labels.ids, scene=mark)
@@ -165,13 +173,13 @@ def describe_file(path: Path) -> dict[str, str]:
         return described | (far if any(origin) else {})
     if path.suffix == ".toml":
         scene = load_scene(path)
-        moving = {name: entry.material or entry.model for name, entry in scene.objects.items() if not entry.fixed}
+        moving = {name: entry.material or entry.model for name, entry in scene.objects.items() if entry.moves}
         return {
             "Gaussians": str(scene.path(scene.input.gaussians)),
             "moving": ", ".join(f"{name} ({material})" for name, material in moving.items()),
             "fixed": ", ".join(name for name, entry in scene.objects.items() if entry.fixed) or "none",
             "frames": f"{scene.simulation.frames} at {scene.simulation.fps:g} per second",
-            "grid spacing": f"{scene.simulation.dx:g} m",
+            "grid spacing": "by the objects' size" if (dx := scene.simulation.dx) is None else f"{dx:g} m",
             "clamp": scene.clamp.mode,
         }
     cameras, names = io.load_cameras(path)

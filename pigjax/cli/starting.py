@@ -11,7 +11,7 @@ import typer
 from pigjax.cli.base import Overwrite, app, console, one_device_per_core, output_path, said
 from pigjax.core.errors import InputError
 
-_UP = "Axis that points up: x, y, z, -x, -y, -z; from the cameras or the ground if not given."
+_UP = "Direction that points up: x, y, z, -x, -y, -z, or 'X Y Z'; from cameras or ground if not given."
 
 
 @app.command()
@@ -41,15 +41,16 @@ def new(
     from pigjax.io.finding import find_parts
 
     found = find_parts(source)
-    given = {"gaussians": gaussians, "masks": masks, "names": names}
-    found = found._replace(**{key: path for key, path in given.items() if path is not None})
+    found = found._replace(
+        gaussians=gaussians or found.gaussians, masks=masks or found.masks, names=names or found.names
+    )
     if found.views is None and found.gaussians is None:
         for line in missing_poses(source, found.photos):
-            console.print(said(line))
+            console.print(said(line), soft_wrap=True)
         raise InputError(f"{source}: holds neither posed photos nor trained splats; {found.problem}")
     if found.gaussians is None:
         for line in (*missing_gaussians(source), *(missing_masks(source) if found.masks is None else ())):
-            console.print(said(line))
+            console.print(said(line), soft_wrap=True)
         raise InputError(f"{source}: holds no trained splats; reconstruct them, or name the file by --gaussians.")
     stem = source.resolve().stem if source.is_file() else source.resolve().name
     folder = io.output_folder(
@@ -60,17 +61,18 @@ def new(
         raise InputError(f"{folder / 'scene.toml'}: exists; give --overwrite to replace it, or another -o.")
     draft = write_draft(found, folder, up=up, ask=_ask if sys.stdin.isatty() and up is None else None)
     for remark in draft.remarks:
-        console.print(said(remark, label="note: ", style="yellow"))
+        console.print(said(remark, label="note: ", style="yellow"), soft_wrap=True)
     for part in draft.parts:
         kind = "fixed" if part.fixed else "jelly, to be changed"
         console.print(said(f"{part.name}: {int(part.members.sum())} splats, {kind}"))
     if found.masks is None and found.views is not None:
         for line in missing_masks(source):
-            console.print(said(line))
-    console.print(said(f"written to {folder / 'scene.toml'}; look at {folder / 'thumbnails'}, edit it, then:"))
-    console.print(said(f"pigjax run {folder / 'scene.toml'} -o {folder / 'out'}"))
+            console.print(said(line), soft_wrap=True)
+    written = f"written to {folder / 'scene.toml'}; look at {folder / 'thumbnails'}, edit it, then:"
+    console.print(said(written), soft_wrap=True)
+    console.print(said(f"pigjax run {folder / 'scene.toml'} -o {folder / 'out'}"), soft_wrap=True)
 
 
 def _ask(guess: str) -> str:
-    """The axis that points up, from who sits at the terminal."""
-    return typer.prompt("Which axis points up (x, y, z, -x, -y, -z)?", default=guess, err=True)
+    """The direction that points up, from who sits at the terminal."""
+    return typer.prompt("Which direction points up (x, y, z, -x, -y, -z, or three numbers)?", default=guess, err=True)

@@ -13,7 +13,7 @@ from pigjax import io
 from pigjax.core.camera import Camera, orbit
 from pigjax.core.checks import Limits, shown
 from pigjax.core.errors import InputError
-from pigjax.scene.plan import axis_of
+from pigjax.scene.world import axis_of
 from pigjax.splat import Gaussians, RenderConfig, render
 from pigjax.splatting.types import extent_of
 

@@ -1,4 +1,4 @@
-"""The Gaussians of a trained scene, which files hold and every stage reads."""
+"""Gaussians of a trained scene, which files hold and every stage reads, and the splats that posing makes of them."""
 
 from __future__ import annotations
 
@@ -19,6 +19,27 @@ class Gaussians(eqx.Module):
     quats: Float[Array, "n 4"] = real_field()  # wxyz, any length; zero means no rotation
     logit_opacities: Float[Array, "n"] = real_field()  # sigmoid gives the opacity in (0, 1)
     sh: Float[Array, "n k 3"] = real_field()  # spherical harmonics, k = (degree + 1)²
+
+    def __check_init__(self) -> None:
+        check_axes(self)
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+
+class Splats(eqx.Module):
+    """Posed Gaussians, ready to draw. The covariance of each is factors @ factorsᵀ.
+
+    Raises:
+        InputError: an array has not its axes, or is not as long as the others.
+    """
+
+    means: Float[Array, "n 3"] = real_field()  # [m]
+    factors: Float[Array, "n 3 3"] = real_field()  # [m]
+    opacities: Float[Array, "n"] = real_field()  # in [0, 1]
+    sh: Float[Array, "n k 3"] = real_field()  # spherical harmonics, k = (degree + 1)²
+    # rotation of the matter since rest; view-dependent colour turns with it
+    sh_rotations: Float[Array, "n 3 3"] | None = real_field(default=None)
 
     def __check_init__(self) -> None:
         check_axes(self)

@@ -24,32 +24,59 @@ Mask = Bool[Array, "... _ _"] | Num[Array, "... _ _"] | Bool[np.ndarray, "... _ 
 
 
 @checked
-def psnr(a: Float[Array, "h w *c"], b: Float[Array, "h w *c"]) -> Float[Array, ""]:
+def psnr(
+    a: Float[Array, "h w *c"], b: Float[Array, "h w *c"], *, valid: Bool[Array | np.ndarray, "h w"] | None = None
+) -> Float[Array, ""]:
     """Peak signal-to-noise ratio [dB] of images `a` and `b` in [0, 1]; inf where they are equal.
+
+    Args:
+        a: an image.
+        b: the other.
+        valid: pixels that count, the same for all channels; None: all.
 
     Raises:
         InputError: the images differ in shape, or hold integers.
     """
     _check_pair(a, b)
-    return -10 * jnp.log10(jnp.mean((a - b) ** 2))
+    return -10 * jnp.log10(_mean((a - b) ** 2, valid))
+
+
+def _mean(values: Float[Array, "h w *c"], valid: Bool[Array | np.ndarray, "h w"] | None) -> Float[Array, ""]:
+    """Mean over the pixels that count; NaN where none does."""
+    if valid is None:
+        return jnp.mean(values)
+    weights = jnp.broadcast_to(valid.reshape(*valid.shape, *[1] * (values.ndim - 2)), values.shape)
+    return jnp.sum(jnp.where(weights, values, 0.0)) / jnp.sum(weights)
 
 
 @checked
 @jax.jit
-def ssim(a: Float[Array, "h w *c"], b: Float[Array, "h w *c"]) -> Float[Array, ""]:
+def ssim(
+    a: Float[Array, "h w *c"], b: Float[Array, "h w *c"], *, valid: Bool[Array | np.ndarray, "h w"] | None = None
+) -> Float[Array, ""]:
     """Structural similarity of images `a` and `b` in [0, 1], mean over pixels and channels (Wang et al. 2004).
 
     As in 3DGS: Gaussian window 11x11 with σ = 1.5 px, zeros beyond the edge. Reverse mode only.
+
+    Args:
+        a: an image.
+        b: the other.
+        valid: pixels that count, the same for all channels; all others are zeros in both images, as beyond the edge.
+            None: all count.
 
     Raises:
         InputError: the images differ in shape, or hold integers.
     """
     _check_pair(a, b)
+    if valid is not None:
+        inside = valid.reshape(*valid.shape, *[1] * (a.ndim - 2))
+        a, b = jnp.where(inside, a, 0.0), jnp.where(inside, b, 0.0)
     a, b = (jnp.moveaxis(jnp.atleast_3d(v), -1, 0) for v in (a, b))
     mean_a, mean_b, squares, product = _blur(jnp.stack([a, b, a * a + b * b, a * b]))
     mean_squares, mean_product = mean_a * mean_a + mean_b * mean_b, mean_a * mean_b
     covariance, variances = product - mean_product, squares - mean_squares
-    return jnp.mean((2 * mean_product + _C1) * (2 * covariance + _C2) / ((mean_squares + _C1) * (variances + _C2)))
+    similar = (2 * mean_product + _C1) * (2 * covariance + _C2) / ((mean_squares + _C1) * (variances + _C2))
+    return _mean(jnp.moveaxis(similar, 0, -1), valid)
 
 
 def _check_pair(a: Any, b: Any) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
@@ -25,6 +25,9 @@ class Views(eqx.Module):
     masks: Int[np.ndarray | Array, "t h w"] | None  # object ids; -1 all over in views without a mask, which do not vote
     splits: tuple[str, ...] = eqx.field(static=True)  # "train", "test", ...
     points_path: Path | None = eqx.field(static=True, default=None)  # sparse cloud for `load_points`
+    # pixels that the photos have and that are not to be ignored: others are never fitted, scored or counted in a vote.
+    # None: all
+    valid: Bool[np.ndarray | Array, "t h w"] | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -39,6 +42,7 @@ class Views(eqx.Module):
             masks=None if self.masks is None else self.masks[chosen],
             splits=tuple(self.splits[i] for i in chosen),
             points_path=self.points_path,
+            valid=None if self.valid is None else self.valid[chosen],
         )
 
     def subset(self, split: str) -> Views:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Literal, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +18,6 @@ from pigjax.coupling.solid import large_parts, parts_of
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians
 
-Keep: TypeAlias = Literal["parts", "largest", "all"]
 KEEPS = ("parts", "largest", "all")
 _NEIGHBOURS = 8  # whose mean distance tells how isolated a Gaussian is
 _ISOLATED = 8.0  # times the object's median of that distance
@@ -86,17 +84,15 @@ def _outliers(means: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"], ke
     return ~kept | ((isolation > _ISOLATED * usual) if usual > 0 else np.zeros(len(means), bool))
 
 
-def told(cut: Mapping[int, int], names: Mapping[int, str], totals: Mapping[int, int]) -> list[str]:
+def told(cut: Mapping[int, int], names: Mapping[int, str]) -> list[str]:
     """One sentence for each object that lost Gaussians.
 
     Args:
         cut: Gaussians that each object lost.
         names: of the ids.
-        totals: Gaussians that each object had.
     """
-    share: dict[int, Any] = {number: 100 * count / max(totals.get(number, count), 1) for number, count in cut.items()}
     return [
-        f"objects.{names.get(number, number)}: {count} Gaussians ({share[number]:.2g} %) lie apart from it and are left"
-        f' where they are; objects.{names.get(number, number)}.keep = "all" would make matter of them.'
+        f"objects.{names.get(number, number)}: {count} Gaussians lie apart from it and stay where they are;"
+        f' objects.{names.get(number, number)}.keep = "all" would make matter of them.'
         for number, count in cut.items()
     ]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from pigjax.core.arguments import checked
@@ -18,7 +19,9 @@ from pigjax.splat import Gaussians
 _NEIGHBOURS = 64  # surface samples that the distance at a point depends on
 _SMOOTHING = 3  # width of their weights, in distances between samples; trained splats lie unevenly
 _MARGIN = 3  # grid samples around the object
-_DEPTH = 16  # grid samples below it: an open surface is solid that deep
+_COARSE = 4  # lattice samples from one that is always computed to the next
+_TOGETHER = 20_000  # points whose neighbours are held at once: 80 MB
+_DEPTH = 16  # grid samples behind it: an open surface is solid that deep
 
 
 @checked
@@ -28,6 +31,7 @@ def collider_from_gaussians(
     spacing: float,
     up: Vector = (0.0, 0.0, 1.0),
     others: Float[np.ndarray, "b 3"] | None = None,
+    eyes: Float[np.ndarray, "e 3"] | None = None,
     friction: float = 0.5,
     mode: str = "separate",
     name: str = "object",
@@ -41,8 +45,10 @@ def collider_from_gaussians(
     Args:
         gaussians: of the object.
         spacing: between samples of the distance, the simulation's dx or finer [m].
-        up: axis of the world that points up; no surface faces down.
+        up: axis of the world that points up; no surface faces down, unless `eyes` saw it from below.
         others: centres of the Gaussians of other objects, which hid parts of the surface [m].
+        eyes: positions of the cameras that saw it [m]: surfaces of any orientation face those that see them. None: not
+            known.
         friction: Coulomb's coefficient; 0.5 is that of many dry solids.
         mode: of `Collider`.
         name: of the object, for messages.
@@ -52,21 +58,72 @@ def collider_from_gaussians(
     """
     shell = shell_of(jax.tree.map(np.asarray, gaussians), name=name)
     above = np.asarray(up, float) / np.linalg.norm(up)
-    points, normals = surface_of(shell, spacing, above, others)
+    points, normals = surface_of(shell, spacing, above, others, eyes)
     if len(points) == 0:
         raise InputError(f"{name}: its Gaussians make no surface, so it cannot be a collider; use a plane or a box.")
-    low = points.min(0) - spacing * (_MARGIN + _DEPTH * np.maximum(above, 0))
-    high = points.max(0) + spacing * (_MARGIN + _DEPTH * np.maximum(-above, 0))
+    behind = above if eyes is None else np.clip(2 * normals.mean(0), -1, 1)
+    low = points.min(0) - spacing * (_MARGIN + _DEPTH * np.maximum(behind, 0))
+    high = points.max(0) + spacing * (_MARGIN + _DEPTH * np.maximum(-behind, 0))
     shape = np.ceil((high - low) / spacing).astype(int) + 1
-    lattice = low + spacing * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
     width = _SMOOTHING * max(shell.spacing, spacing)
-    samples = signed_distance(lattice.reshape(-1, 3), points, normals, width).reshape(shape)
+    samples = sampled_distance(points, normals, width, low, spacing, shape)
     numbers = (jnp.asarray(v, jnp.result_type(float)) for v in (samples, low, spacing, friction))
     return SampledDistance(**dict(zip(("samples", "origin", "dx", "friction"), numbers)), mode=mode)
 
 
+def sampled_distance(
+    points: Float[np.ndarray, "s 3"],
+    normals: Float[np.ndarray, "s 3"],
+    width: float,
+    low: Float[np.ndarray, "3"],
+    spacing: float,
+    shape: Int[np.ndarray, "3"],
+) -> Float[np.ndarray, "x y z"]:
+    """Signed distance on a lattice [m]: exact near the surface, interpolated where it is far.
+
+    Every fourth sample is computed, and all samples of the coarse cells that may hold the surface; a distance changes
+    by no more than the path, so that the other cells do not. Work and memory grow with the surface, not with the box.
+
+    Args:
+        points: surface samples [m].
+        normals: their unit normals, outward.
+        width: least width of the weights [m].
+        low: first sample of the lattice [m].
+        spacing: between its samples [m].
+        shape: samples along each axis.
+    """
+    cells = -(-(shape - 1) // _COARSE)
+    tree = cKDTree(points)
+
+    def exact(index: Int[np.ndarray, "p 3"]) -> Float[np.ndarray, "p"]:
+        return signed_distance(low + spacing * index, points, normals, width, tree)
+
+    corners = np.stack(np.meshgrid(*(np.arange(n + 1) for n in cells), indexing="ij"), -1).reshape(-1, 3)
+    coarse = exact(_COARSE * corners).reshape(cells + 1)
+    fine = coarse
+    for axis in range(3):
+        at = np.arange(_COARSE * cells[axis] + 1) / _COARSE
+        below = np.minimum(at.astype(int), max(cells[axis] - 1, 0))
+        share = (at - below).reshape([-1 if k == axis else 1 for k in range(3)])
+        above = np.minimum(below + 1, cells[axis])
+        fine = (1 - share) * fine.take(below, axis) + share * fine.take(above, axis)
+    reach = (_COARSE * np.sqrt(3) / 2 + 1) * spacing  # no point of a cell is further from the nearest of its corners
+    near = ndimage.minimum_filter(np.abs(coarse), 2, origin=-1)[tuple(slice(n) for n in cells)] <= reach
+    inner = np.stack(np.meshgrid(*[np.arange(_COARSE + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    wanted = np.zeros(fine.shape, bool)
+    for offset in inner:
+        wanted[tuple(slice(o, o + _COARSE * n, _COARSE) for o, n in zip(offset, cells))] |= near
+    index = np.argwhere(wanted)
+    fine[tuple(index.T)] = exact(index)
+    return fine[tuple(slice(n) for n in shape)]
+
+
 def signed_distance(
-    at: Float[np.ndarray, "p 3"], points: Float[np.ndarray, "s 3"], normals: Float[np.ndarray, "s 3"], width: float
+    at: Float[np.ndarray, "p 3"],
+    points: Float[np.ndarray, "s 3"],
+    normals: Float[np.ndarray, "s 3"],
+    width: float,
+    tree: cKDTree | None = None,
 ) -> Float[np.ndarray, "p"]:
     """Signed distance from an oriented point cloud [m], negative behind it: moving averages (Alexa & Adamson 2004).
 
@@ -79,8 +136,22 @@ def signed_distance(
         points: surface samples [m].
         normals: their unit normals, outward.
         width: least width of the weights [m].
+        tree: of the points, where there is one already.
     """
-    gap, nearest = cKDTree(points).query(at, k=min(_NEIGHBOURS, len(points)), workers=-1)
+    tree = cKDTree(points) if tree is None else tree
+    parts = [_distance(at[k : k + _TOGETHER], points, normals, width, tree) for k in range(0, len(at), _TOGETHER)]
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def _distance(
+    at: Float[np.ndarray, "p 3"],
+    points: Float[np.ndarray, "s 3"],
+    normals: Float[np.ndarray, "s 3"],
+    width: float,
+    tree: cKDTree,
+) -> Float[np.ndarray, "p"]:
+    """`signed_distance` of so many points that their neighbours fit into little memory."""
+    gap, nearest = tree.query(at, k=min(_NEIGHBOURS, len(points)), workers=-1)
     gap, nearest = gap.reshape(len(at), -1), nearest.reshape(len(at), -1)
     reach = np.maximum(width, 0.5 * gap[:, :1])
     weights = np.exp(-(gap**2 - gap[:, :1] ** 2) / (2 * reach**2))

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from pigjax.core.arguments import checked
 from pigjax.core.errors import InputError
@@ -33,6 +34,7 @@ def seed_particles(
     fill: bool = True,
     spacing: float | int | None = None,
     velocities: Mapping[int, Any] | None = None,
+    spins: Mapping[int, Any] | None = None,
     particles_per_cell: float | int = 8,
     gaussians_per_cell: int | None = None,
     colliders: Sequence[Collider] = (),
@@ -56,6 +58,7 @@ def seed_particles(
         spacing: edge of the cell that `particles_per_cell` refers to, usually the simulation's dx [m]. By default all
             objects together get about 40,000 lattice cells.
         velocities: initial velocity [m/s] by object id, zero for the others.
+        spins: initial angular velocity [rad/s] by object id about the object's centre of mass, zero for the others.
         particles_per_cell: lattice particles in a full cell; 8 is two along each axis, as usual in MPM.
         gaussians_per_cell: most Gaussians that become particles in one lattice cell; `bind` finds carriers for the
             others. None: no limit.
@@ -68,12 +71,13 @@ def seed_particles(
         Particles, and the table of their materials.
 
     Raises:
-        InputError: no materials; an id that is 0, negative or has no Gaussians; a velocity for an id without material;
-            labels of another length; two objects in the same place; or a spacing that gives no or too many particles.
+        InputError: no materials; an id that is 0, negative or has no Gaussians; a velocity or spin for an id without
+            material; labels of another length; two objects in the same place; or a spacing that gives no or too many
+            particles.
     """
     object_id = object_ids(gaussians, labels)
-    velocities = dict(velocities or {})
-    _check_ids(object_id, materials, velocities)
+    velocities, spins = dict(velocities or {}), dict(spins or {})
+    _check_ids(object_id, materials, {**spins, **velocities})
     host = jax.tree.map(np.asarray, gaussians)
     objects = []
     for name in materials:
@@ -98,7 +102,23 @@ def seed_particles(
         gaussian=carried,
         body=rows,
     )
-    return particles, table
+    turns = {row: np.asarray(spins[item.name], float) for row, item in enumerate(objects) if item.name in spins}
+    return _spun(particles, turns), table
+
+
+def _spun(particles: Particles, turns: Mapping[int, Float[np.ndarray, "3"]]) -> Particles:
+    """Particles with those of some rows of the table set spinning about their centre of mass [rad/s]."""
+    if not turns:
+        return particles
+    v, C = np.array(particles.v), np.array(particles.C)
+    x, mass, rows = (np.asarray(a) for a in (particles.x, particles.mass, particles.material))
+    for row, turn in turns.items():
+        mine = rows == row
+        weights = mass[mine].astype(np.float64)
+        middle = (weights[:, None] * x[mine]).sum(0) / weights.sum()
+        v[mine] += np.cross(turn, x[mine] - middle)
+        C[mine] += np.cross(turn, np.eye(3)).T  # the velocity's gradient, so that the first step keeps the spin
+    return eqx.tree_at(lambda p: (p.v, p.C), particles, (jnp.asarray(v), jnp.asarray(C)))
 
 
 class _Object(NamedTuple):

@@ -22,6 +22,8 @@ _NEIGHBOURS = 24  # surface samples within about two voxels
 _LEAST_OPACITY = 0.05  # fainter Gaussians are not part of the surface
 _LEAST_SKY = 2.0  # a sample that sees less of the outside, or sees it on both sides, has no known outer side
 _LEAST_DISCS = 8
+_EYES = 16  # cameras that are asked for the outer side of a surface
+_LEAST_TOWARDS = 0.05  # of their mean unit direction along a normal; less is seen from both sides, or hidden
 _LEAST_JUMP = 0.3  # least jump of the winding number across the surface of a shell
 _FULL = 0.25  # share of inner voxels with Gaussians in them above which a cloud is filled, not a shell
 _MOST_SWELLING = 2.0  # volume of a filled cloud's density over that of its winding number; strays in a shell exceed it
@@ -187,22 +189,28 @@ class _Discs(NamedTuple):
 
 
 def surface_of(
-    shell: Shell, spacing: float, up: Float[np.ndarray, "3"], blockers: Float[np.ndarray, "b 3"] | None = None
+    shell: Shell,
+    spacing: float,
+    up: Float[np.ndarray, "3"],
+    blockers: Float[np.ndarray, "b 3"] | None = None,
+    eyes: Float[np.ndarray, "e 3"] | None = None,
 ) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
     """Points [m] on a surface that was seen from above, and their outward unit normals.
 
-    The surface may be open below, as a table or a floor is: no normal points away from all cameras.
+    The surface may be open below, as a table or a floor is: no normal points away from all cameras. Where the cameras
+    are known, the outer side of what they see is theirs, so that walls and ceilings have one, too.
 
     Args:
         shell: of `shell_of`.
         spacing: distance between the points [m].
         up: unit vector.
         blockers: points of other objects [m], which hid parts of the surface; no points are placed there.
+        eyes: positions of the cameras [m]; None: not known.
 
     Returns:
         Points and normals, both empty if there is no surface with an outer side.
     """
-    discs, _, _ = _discs_of(shell, max(shell.spacing, spacing), _DIRECTIONS[_DIRECTIONS @ up > -0.1], blockers)
+    discs, _, _ = _discs_of(shell, max(shell.spacing, spacing), _DIRECTIONS[_DIRECTIONS @ up > -0.1], blockers, eyes)
     if discs is None:
         return np.zeros((0, 3)), np.zeros((0, 3))
     sided = discs.areas > 0
@@ -219,6 +227,7 @@ def _discs_of(
     voxel: float,
     directions: Int[np.ndarray, "d 3"] = _DIRECTIONS,
     blockers: Float[np.ndarray, "b 3"] | None = None,
+    eyes: Float[np.ndarray, "e 3"] | None = None,
 ) -> tuple[_Discs | None, Bool[np.ndarray, "x y z"], Float[np.ndarray, "3"]]:
     """Oriented discs on the shell, None if they are too few; the voxels that it occupies, and their corner [m]."""
     kept = _surface_members(shell)
@@ -236,20 +245,22 @@ def _discs_of(
         cells = np.floor((blockers - origin) / voxel).astype(int)
         occupied[tuple(cells[np.all((cells >= 0) & (cells < shape), 1)].T)] = True
     sky = _sky(occupied, np.stack(np.unravel_index(flat, shape), 1), directions)
-    seen = np.any(sky != 0, 1)
+    towards = None if eyes is None else _towards_eyes(occupied, points, (points - origin) / voxel, eyes)
+    seen = np.any(sky != 0, 1) if towards is None else np.any(sky != 0, 1) | np.any(towards != 0, 1)
     if seen.sum() < _LEAST_DISCS:
         return None, occupied, origin
-    discs = _oriented_discs(points[seen], sky[seen], voxel)
+    discs = _oriented_discs(points[seen], sky[seen], voxel, None if towards is None else towards[seen])
     return (discs if discs.areas.any() else None), occupied, origin
 
 
 def _disc_samples(shell: Shell, kept: Bool[np.ndarray, "n"], voxel: float) -> Float[np.ndarray, "s 3"]:
     """Points on each Gaussian's disc of one standard deviation, about one per voxel; a round one gives its centre.
 
-    Discs are clamped to a quarter of the object, since wider Gaussians do not describe its surface.
+    Discs are clamped to a quarter of the object, and to twice the distance to their sixth neighbour: wider Gaussians do
+    not describe its surface, which their neighbours do there, but stand out from it wherever it is curved.
     """
     means, axes = shell.means[kept], shell.axes[kept]
-    widest = np.ptp(means, axis=0).max() / 8
+    widest = _widest(means, voxel)[:, None]
     lengths = np.linalg.norm(axes, axis=1)
     # the extent along the shortest axis is blur; it is subtracted from the other two
     extent = np.minimum(np.sqrt(np.maximum(lengths[:, :2] ** 2 - lengths[:, 2:] ** 2, 0)), widest)
@@ -263,6 +274,15 @@ def _disc_samples(shell: Shell, kept: Bool[np.ndarray, "n"], voxel: float) -> Fl
     angle = index * np.pi * (3 - np.sqrt(5))  # a sunflower's spiral covers a disc evenly
     planar = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1) * extent[owner]
     return means[owner] + np.einsum("sij,sj->si", directions[owner], planar)
+
+
+def _widest(means: Float[np.ndarray, "n 3"], voxel: float) -> Float[np.ndarray, "n"]:
+    """Largest radius of each disc [m]."""
+    quarter = np.ptp(means, axis=0).max() / 8
+    if len(means) < 7:
+        return np.full(len(means), quarter)
+    distances, _ = cKDTree(means).query(means, k=7, workers=-1)
+    return np.minimum(quarter, np.maximum(2 * distances[:, -1], voxel))
 
 
 def _sky(
@@ -291,8 +311,50 @@ def _blocked(occupied: Bool[np.ndarray, "x y z"], direction: Int[np.ndarray, "3"
     return np.moveaxis(ahead, 0, axis)
 
 
-def _oriented_discs(points: Float[np.ndarray, "s 3"], sky: Float[np.ndarray, "s 3"], voxel: float) -> _Discs:
-    """Normals from the plane of the nearest samples, outward by the neighbours' sky; areas from their density."""
+def _towards_eyes(
+    occupied: Bool[np.ndarray, "x y z"],
+    points: Float[np.ndarray, "s 3"],
+    cells: Float[np.ndarray, "s 3"],
+    eyes: Float[np.ndarray, "e 3"],
+) -> Float[np.ndarray, "s 3"]:
+    """Mean of the unit directions to the cameras from which each point is not hidden; 0 where all are.
+
+    Args:
+        occupied: voxels with samples.
+        points: samples [m].
+        cells: the same, in voxels.
+        eyes: positions of the cameras [m]; some sixteen of them, spread over all, are tried.
+    """
+    total, shape = np.zeros((len(points), 3)), np.array(occupied.shape)
+    for eye in eyes[np.unique(np.linspace(0, len(eyes) - 1, _EYES).astype(int))]:
+        direction = eye - points
+        distance = np.linalg.norm(direction, axis=1, keepdims=True)
+        direction = direction / np.maximum(distance, 1e-12)
+        open_ = np.ones(len(points), bool)
+        ahead = np.arange(len(points))  # those whose ray is still within the grid
+        for step in range(2, int(np.linalg.norm(shape)) + 2):  # the first voxels hold the surface itself
+            place = np.floor(cells[ahead] + step * direction[ahead]).astype(int)
+            within = np.all((place >= 0) & (place < shape), 1)
+            ahead, place = ahead[within], place[within]
+            if not len(ahead):
+                break
+            hit = occupied[tuple(place.T)]
+            open_[ahead[hit]] = False
+            ahead = ahead[~hit]
+        total += open_[:, None] * direction
+    return total / max(min(_EYES, len(eyes)), 1)
+
+
+def _oriented_discs(
+    points: Float[np.ndarray, "s 3"],
+    sky: Float[np.ndarray, "s 3"],
+    voxel: float,
+    towards: Float[np.ndarray, "s 3"] | None = None,
+) -> _Discs:
+    """Normals from the plane of the nearest samples, outward by the neighbours' sky; areas from their density.
+
+    Where cameras look at a sample from one side, `towards` them is outward.
+    """
     reach, neighbours = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))
     weights = np.exp(-(reach**2) / (2 * voxel**2))
     few, few_weights = neighbours[:, :8], weights[:, :8] / weights[:, :8].sum(1, keepdims=True)
@@ -300,8 +362,12 @@ def _oriented_discs(points: Float[np.ndarray, "s 3"], sky: Float[np.ndarray, "s 
     patch = points[neighbours[:, :14]]
     patch = patch - patch.mean(1, keepdims=True)
     normals = np.linalg.eigh(np.einsum("ski,skj->sij", patch, patch))[1][:, :, 0]
+    if towards is not None:
+        towards = np.einsum("sk,skj->sj", few_weights, towards[few])
+        told = np.abs(np.sum(normals * towards, 1)) >= _LEAST_TOWARDS
+        sky = np.where(told[:, None], _LEAST_SKY * towards / np.linalg.norm(towards, axis=1).clip(1e-12)[:, None], sky)
     normals *= np.where(np.sum(normals * sky, 1) < 0, -1, 1)[:, None]
-    clear = np.linalg.norm(sky, axis=1) >= _LEAST_SKY
+    clear = np.linalg.norm(sky, axis=1) >= _LEAST_SKY * (1 - 1e-9)
     # samples on the back of a thin wall are as near as those on the front, but not part of its density
     same_side = (np.einsum("skj,sj->sk", normals[neighbours], normals) > 0) & clear[neighbours]
     density = np.sum(weights * same_side, 1) / (2 * np.pi * voxel**2)

@@ -20,42 +20,53 @@ from pigjax.io.files import (
     remove,
     safe_name,
     safe_names,
+    toml_text,
     write_json,
     write_text,
     write_toml,
     writing,
 )
 from pigjax.io.formats import load_gaussians, origin_of, read_gaussians
-from pigjax.io.images import contact_sheet, read_image, write_image
+from pigjax.io.gltf import Mesh, save_glb, save_mesh
+from pigjax.io.images import contact_sheet, data_uri, read_image, write_image
 from pigjax.io.labels import StoredLabels, digest_of_scene, load_labels, save_labels
-from pigjax.io.masks import load_masks, save_masks
+from pigjax.io.masks import load_masks, load_stroke, save_masks
+from pigjax.io.page import save_page
 from pigjax.io.ply import load_ply, load_points, read_ply, save_ply
+from pigjax.io.points import save_points
 from pigjax.io.provenance import check_same, claim, digest, file_digest, parts_of
 from pigjax.io.state import (
+    ROWS,
     STATES,
     last_state,
     load_pytree,
+    load_rows,
     load_state,
     readable_states,
     remove_state,
     resumed,
     save_pytree,
+    save_rows,
     save_state,
     set_aside,
     signed,
     state_frames,
 )
+from pigjax.io.usd import read_usd, save_usd
 from pigjax.io.video import read_video, write_video
 
 __all__ = [
     "LAYOUTS",
+    "ROWS",
     "STATES",
     "Dataset",
+    "Mesh",
     "StoredLabels",
     "Views",
     "check_same",
     "claim",
     "contact_sheet",
+    "data_uri",
     "decoding",
     "digest",
     "digest_of_scene",
@@ -73,7 +84,9 @@ __all__ = [
     "load_ply",
     "load_points",
     "load_pytree",
+    "load_rows",
     "load_state",
+    "load_stroke",
     "load_views",
     "origin_of",
     "output_folder",
@@ -84,6 +97,7 @@ __all__ = [
     "read_json",
     "read_ply",
     "read_toml",
+    "read_usd",
     "read_video",
     "readable_states",
     "remove",
@@ -93,14 +107,21 @@ __all__ = [
     "safe_names",
     "save_arrays",
     "save_figure",
+    "save_glb",
     "save_labels",
     "save_masks",
+    "save_mesh",
+    "save_page",
     "save_ply",
+    "save_points",
     "save_pytree",
+    "save_rows",
     "save_state",
+    "save_usd",
     "set_aside",
     "signed",
     "state_frames",
+    "toml_text",
     "write_csv",
     "write_image",
     "write_json",

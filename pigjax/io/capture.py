@@ -7,7 +7,7 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pigjax.core.errors import InputError
+from pigjax.io.lenses import Lens, lens_of, pinhole_of
 from pigjax.io.origin import Origin, checked_origin, proper_origin, remedy_for
 
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -42,13 +43,27 @@ _LONGEST = 65535  # [px]
 _FAR_CENTRE = 100  # principal points this many image sides away come from a damaged file
 _FIELD = (1e-2, 1e6)  # focal length over image side: fields of view from 0.0001 to 179 degrees
 _COARSE, _TOO_COARSE = 1e-4, 1e-3  # rounding of camera positions over the extent of the cameras: warned of, refused
-_LENS_NUMBER = re.compile(r"k\d?|p\d|s\d|b\d|ftheta_p\d|distortion_params|distortion_coefficients|rolling_shutter")
-_LENS_FLAGS = ("is_fisheye", "fisheye", "latlong", "equirectangular", "orthographic")
+_LENS_NUMBER = re.compile(
+    r"k\d?|p\d|s\d|s[xy]\d|b\d|q\d|omega|ftheta_p\d|distortion_params|distortion_coefficients|rolling_shutter"
+)
+_FISHEYE_FLAGS = ("is_fisheye", "fisheye")
+_LENS_FLAGS = (*_FISHEYE_FLAGS, "latlong", "equirectangular", "orthographic")
+_LEAST_REACH = 0.02  # of a lens that draws a picture at all: a field of 2 degrees; smaller ones come from damaged files
+_SMALLER = (2, 4, 8)  # nerfstudio's folders of shrunk photos, images_2 and so on
+_OF_MODEL: dict[str, tuple[str, ...]] = {  # coefficients by nerfstudio's names, where they are not those of COLMAP's
+    "PINHOLE": ("k1", "k2", "k3", "k4", "p1", "p2", "sx1", "sy1"),
+    "FULL_OPENCV": ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+    "THIN_PRISM_FISHEYE": ("k1", "k2", "k3", "k4", "p1", "p2", "sx1", "sy1"),
+    "FOV": ("omega",),
+}
+_OTHER_NAMES = {"sx1": "s1", "sy1": "s2", "k": "k1"}
+_DIVISOR = {"k4": "q1", "k5": "q2", "k6": "q3"}  # of OpenCV's rational model
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One photo and its pinhole camera in OpenCV axes, as a file describes it."""
+    """One photo and its camera in OpenCV axes, as a file describes it."""
 
     where: str  # file and entry, for messages
     image: Path  # where the photo is, or should be
@@ -57,6 +72,26 @@ class Shot:
     centre: tuple[float, float]  # [px]
     size: tuple[int, int]  # width, height [px]
     split: str | None = None
+    lens: Lens | None = None  # None: a pinhole
+    keep: Path | None = None  # mask of the photo that is 0 where a pixel is to be ignored
+    circle: float | None = None  # radius around the photo's middle beyond which a fisheye draws nothing [px]
+
+    def scaled(self, size: tuple[int, int]) -> Shot:
+        """The same photo at another size [px]."""
+        x, y = (new / old for new, old in zip(size, self.size))
+        return replace(
+            self,
+            focal=(self.focal[0] * x, self.focal[1] * y),
+            centre=(self.centre[0] * x, self.centre[1] * y),
+            size=size,
+            circle=None if self.circle is None else self.circle * min(x, y),
+        )
+
+    def pinhole(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Focal lengths and principal point of the undistorted picture [px], which has the photo's size."""
+        if self.lens is None:
+            return self.focal, self.centre
+        return pinhole_of(self.lens, self.focal, self.centre, self.size)
 
 
 @dataclass(frozen=True)
@@ -84,7 +119,8 @@ def without_suffix(name: str) -> str:
 def find_images(folder: Path, names: Sequence[str], *, elsewhere: bool) -> list[Path]:
     """The photo of each name in `folder`; where there is none, the path where it should be.
 
-    The suffix may be left out. Leading folders of a name may be left out where `folder` itself ends with them, or, with
+    Of photos that are not there, those in nerfstudio's folders of shrunk ones count: images_2, images_4, images_8. The
+    suffix may be left out. Leading folders of a name may be left out where `folder` itself ends with them, or, with
     `elsewhere`, where all names share them: a photo of the same file name from another folder is another photo.
 
     Args:
@@ -99,7 +135,17 @@ def find_images(folder: Path, names: Sequence[str], *, elsewhere: bool) -> list[
     columns = zip(*(path.parent.parts for path in paths)) if elsewhere else ()
     shared = sum(1 for _ in takewhile(lambda column: len(set(column)) == 1, columns))
     home = Path(os.path.abspath(folder)).parts
-    return [_find_image(folder, path, shared, home) for path in paths]
+    found = [_find_image(folder, path, shared, home) for path in paths]
+    return found if elsewhere else [_or_shrunk(photo) for photo in found]
+
+
+def _or_shrunk(photo: Path) -> Path:
+    """The photo, or the largest shrunk one where it is missing."""
+    if os.path.isfile(photo):
+        return photo
+    parent = photo.parent
+    shrunk = (parent.with_name(f"{parent.name}_{factor}") / photo.name for factor in _SMALLER if parent.name)
+    return next((path for path in shrunk if os.path.isfile(path)), photo)
 
 
 def _find_image(folder: Path, name: PurePosixPath, shared: int, home: tuple[str, ...]) -> Path:
@@ -240,30 +286,64 @@ def check_positions(shots: Sequence[Shot], origin: Origin | None = None) -> None
     warnings.warn(said, stacklevel=4)
 
 
-def check_pinhole(model: str, fields: Mapping[str, Any], where: str, known: tuple[str, ...]) -> None:
-    """Refuse lenses that bend straight lines, and shutters that roll.
+def read_lens(model: str, fields: Mapping[str, Any], where: str, known: Sequence[str]) -> Lens | None:
+    """The lens of a camera; None where it is a pinhole.
 
     Args:
-        model: the camera model's name.
-        fields: fields or parameters of the camera by name; those that describe no lens are not looked at.
+        model: the camera model's name, in COLMAP's words.
+        fields: coefficients and flags by name; those that describe no lens are not looked at. k1 to k4 are those of the
+            radial polynomial (of FULL_OPENCV k4 to k6 those of its divisor), p1 and p2 OpenCV's tangential ones.
         where: file and entry, for messages.
-        known: camera models that are pinholes without distortion.
+        known: models that the file may name.
 
     Raises:
-        InputError: `model` is not in `known`, a distortion coefficient is not zero, or a flag names another lens.
+        InputError: `model` is not in `known`, or a coefficient or flag that is not zero is none of its lens.
     """
     if model not in known:
         raise InputError(
             f"{where}: camera model {model!r} is not known ({', '.join(known)}); undistort to PINHOLE first."
         )
+    flags = [name for name in _FISHEYE_FLAGS if fields.get(name) is True]
+    if flags and "FISHEYE" not in model:
+        model = "OPENCV_FISHEYE"
+    family = "THIN_PRISM_FISHEYE" if model.endswith("RADIAL_FISHEYE") else model
+    names = _OF_MODEL.get(family, _OF_MODEL["PINHOLE"])
+    values: dict[str, float] = {}
     for name, value in fields.items():
-        if (name in _LENS_FLAGS or _LENS_NUMBER.fullmatch(name)) and not _is_zero(value):
+        if name in flags or not is_of_lens(name) or _is_zero(value):
+            continue
+        plain = "k1" if name == "k" else name
+        if plain not in names or isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e6:
             what = "" if name in _LENS_FLAGS or name == "rolling_shutter" else "distortion "
             shown = "true" if value is True else f"{value}"
             raise InputError(
                 f"{where}: {model} has {what}{name} = {shown}, which is not modelled; undistort the images first"
                 " (for example colmap image_undistorter)."
             )
+        divisor = _DIVISOR if model == "FULL_OPENCV" else {}
+        values[divisor.get(plain, _OTHER_NAMES.get(plain, plain))] = float(value)
+    lens = lens_of(model, values)
+    return lens if lens.bends else None
+
+
+def check_lens(lens: Lens | None, focal: tuple[float, float], centre: tuple[float, float], size: tuple[int, int],
+               where: str) -> None:  # fmt: skip
+    """Refuse lenses that draw no picture: their polynomial folds back near the axis.
+
+    Raises:
+        InputError: the field of the undistorted picture is below 2 degrees, or outside of that of cameras.
+    """
+    if lens is None:
+        return
+    if lens.reach >= _LEAST_REACH:
+        with np.errstate(all="ignore"):
+            found = pinhole_of(lens, focal, centre, size)
+        if all(_FIELD[0] <= f / side <= _FIELD[1] for f, side in zip(found[0], size)) and np.isfinite(found[1]).all():
+            return
+    raise InputError(
+        f"{where}: the lens ({lens}) bends so much that its picture folds back {lens.reach:.3g} focal lengths from its"
+        " middle; check the distortion coefficients, or undistort the images first."
+    )
 
 
 def is_of_lens(name: str) -> bool:

@@ -14,26 +14,18 @@ import numpy as np
 from jaxtyping import Float
 
 from pigjax.core.errors import InputError
-from pigjax.io.capture import Capture, Shot, check_intrinsics, check_pinhole, find_images, rigid
+from pigjax.io.capture import Capture, Shot, check_intrinsics, check_lens, find_images, read_lens, rigid
 from pigjax.io.files import decoding, existing
+from pigjax.io.lenses import COLMAP, Lens
 
-# Names of the parameters after the focal lengths and the principal point, in the order of COLMAP's model numbers.
-_PARAMETERS: dict[str, tuple[str, ...]] = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fx", "fy", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
-    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-}
-_BINARY_MODELS = tuple(_PARAMETERS)
-_PINHOLES = tuple(name for name in _PARAMETERS if name != "OPENCV_FISHEYE")
-_PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0")
+_ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+# the names that its documentation gives to coefficients, where those of the lens are others
+_DOCUMENTED = {"q1": "k4", "q2": "k5", "q3": "k6", "s1": "sx1", "s2": "sy1"}
+_PLACES = ("sparse", "colmap/sparse")
 
 
 @dataclass(frozen=True)
-class _Lens:
+class _Entry:
     """One line of `cameras`."""
 
     model: str
@@ -52,10 +44,42 @@ class _Pose:
     lens: int
 
 
-def find_model(folder: Path) -> Path | None:
-    """The folder in or under `folder` that holds a sparse model."""
-    places = (folder / place for place in _PLACES)
-    return next((at for at in places if any((at / f"images{kind}").is_file() for kind in (".bin", ".txt"))), None)
+def find_model(folder: Path) -> tuple[Path | None, tuple[str, ...]]:
+    """The folder in or under `folder` that holds a sparse model, and remarks on others.
+
+    COLMAP leaves one model for each group of photos that it could connect (sparse/0, sparse/1, ...): the one with the
+    most photos is taken, the first of equals, and a remark tells of the others.
+    """
+    if _is_model(folder):
+        return folder, ()
+    for place in _PLACES:
+        if not (folder / place).is_dir():
+            continue
+        inner = sorted((at for at in (folder / place).iterdir() if at.is_dir()), key=lambda at: (len(at.name), at.name))
+        models = [at for at in (*inner, folder / place) if _is_model(at)]
+        if len(models) == 1:
+            return models[0], ()
+        if models:
+            counts = {model: _count_photos(model) for model in models}
+            largest = max(models, key=lambda model: counts[model])
+            listed = ", ".join(f"{model.name} ({count} photos)" for model, count in counts.items())
+            said = f"{folder / place}: holds several models: {listed}; {largest.name} is read, name another to read it."
+            return largest, (said,)
+    return None, ()
+
+
+def _is_model(folder: Path) -> bool:
+    return any((folder / f"images{kind}").is_file() for kind in (".bin", ".txt"))
+
+
+def _count_photos(model: Path) -> int:
+    file = model / "images.bin"
+    if file.is_file():
+        with _decoding(file):
+            return int(_Reader(file).take("Q")[0])
+    file = model / "images.txt"
+    with _decoding(file):
+        return sum(1 for _ in _text_images(file))
 
 
 def read_model(model: Path, *, root: Path, images: Path | None = None) -> Capture:
@@ -63,22 +87,21 @@ def read_model(model: Path, *, root: Path, images: Path | None = None) -> Captur
 
     Raises:
         MissingFileError: a file of the model is missing.
-        InputError: the model is damaged, a camera is no pinhole, or a pose is not rigid.
+        InputError: the model is damaged, a camera model is not known, or a pose is not rigid.
     """
     kind = ".bin" if (model / "images.bin").is_file() else ".txt"
     cameras_file, images_file = existing(model / f"cameras{kind}", "file"), existing(model / f"images{kind}", "file")
     with _decoding(cameras_file):
         numbered = list(_binary_cameras(cameras_file) if kind == ".bin" else _text_cameras(cameras_file))
-        lenses = dict(numbered)
+        entries = dict(numbered)
         _check_once([number for number, _ in numbered], "camera", cameras_file)
     with _decoding(images_file):
         poses = list(_binary_images(images_file) if kind == ".bin" else _text_images(images_file))
         _check_once([pose.number for pose in poses], "image", images_file)
-    for number, lens in lenses.items():
-        _check_lens(lens, f"{cameras_file}: camera {number}")
+    bent = {number: _lens_of(entry, f"{cameras_file}: camera {number}") for number, entry in entries.items()}
     poses.sort(key=lambda pose: pose.name)
     photos = find_images(images or root / "images", [pose.name for pose in poses], elsewhere=images is not None)
-    shots = tuple(_shot(pose, lenses, photo, images_file) for pose, photo in zip(poses, photos))
+    shots = tuple(_shot(pose, entries, bent, photo, images_file) for pose, photo in zip(poses, photos))
     points = (model / f"points3D{suffix}" for suffix in (".bin", ".txt", ".ply"))
     return Capture(root, shots, next((path for path in points if path.is_file()), None))
 
@@ -109,32 +132,39 @@ def _check_once(numbers: list[int], what: str, path: Path) -> None:
         raise InputError(f"{path}: lists {what} {twice[0]} more than once; export the model again.")
 
 
-def _check_lens(lens: _Lens, where: str) -> None:
-    names = _PARAMETERS.get(lens.model, ())
-    check_pinhole(lens.model, dict(zip(names, lens.values)), where, _PINHOLES)
-    if len(lens.values) != len(names):
-        raise InputError(f"{where}: {lens.model} has {len(names)} parameters, not {len(lens.values)}; export it again.")
-    check_intrinsics(_focal(lens), _centre(lens), lens.size, where)
+def _lens_of(entry: _Entry, where: str) -> Lens | None:
+    """The lens of a camera, checked; None where it is a pinhole."""
+    own = COLMAP.get(entry.model, ())
+    head = 3 if entry.model in _ONE_FOCAL else 4
+    names = [_DOCUMENTED.get(name, name) for name in own]
+    lens = read_lens(entry.model, dict(zip(names, entry.values[head:])), where, tuple(COLMAP))
+    if len(entry.values) != head + len(own):
+        count = head + len(own)
+        raise InputError(f"{where}: {entry.model} has {count} parameters, not {len(entry.values)}; export it again.")
+    check_intrinsics(_focal(entry), _centre(entry), entry.size, where)
+    check_lens(lens, _focal(entry), _centre(entry), entry.size, where)
+    return lens
 
 
-def _focal(lens: _Lens) -> tuple[float, float]:
-    return (lens.values[0], lens.values[_PARAMETERS[lens.model].index("cx") - 1])
+def _focal(entry: _Entry) -> tuple[float, float]:
+    return entry.values[0], entry.values[0 if entry.model in _ONE_FOCAL else 1]
 
 
-def _centre(lens: _Lens) -> tuple[float, float]:
-    first = _PARAMETERS[lens.model].index("cx")
-    return lens.values[first], lens.values[first + 1]
+def _centre(entry: _Entry) -> tuple[float, float]:
+    first = 1 if entry.model in _ONE_FOCAL else 2
+    return entry.values[first], entry.values[first + 1]
 
 
-def _shot(pose: _Pose, lenses: dict[int, _Lens], photo: Path, file: Path) -> Shot:
+def _shot(pose: _Pose, entries: dict[int, _Entry], lenses: dict[int, Lens | None], photo: Path, file: Path) -> Shot:
     where = f"{file}: image {pose.name!r}"
-    if pose.lens not in lenses:
+    if pose.lens not in entries:
         raise InputError(f"{where}: names camera {pose.lens}, which the model lacks; export the model again.")
-    lens = lenses[pose.lens]
+    entry = entries[pose.lens]
     world_to_cam = np.eye(4)
     world_to_cam[:3, :3] = _rotation(np.asarray(pose.quat))
     world_to_cam[:3, 3] = pose.shift
-    return Shot(where, photo, rigid(world_to_cam, where), _focal(lens), _centre(lens), lens.size)
+    pose_matrix = rigid(world_to_cam, where)
+    return Shot(where, photo, pose_matrix, _focal(entry), _centre(entry), entry.size, lens=lenses[pose.lens])
 
 
 def _rotation(quat: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
@@ -153,10 +183,10 @@ def _text_lines(path: Path) -> list[str]:
     return [line for line in path.read_text(encoding="utf-8-sig").split("\n") if not line.startswith("#")]
 
 
-def _text_cameras(path: Path) -> Iterator[tuple[int, _Lens]]:
+def _text_cameras(path: Path) -> Iterator[tuple[int, _Entry]]:
     for line in filter(str.strip, _text_lines(path)):
         number, model, width, height, *values = line.split()
-        yield int(number), _Lens(model, (int(width), int(height)), tuple(map(float, values)))
+        yield int(number), _Entry(model, (int(width), int(height)), tuple(map(float, values)))
 
 
 def _text_images(path: Path) -> Iterator[_Pose]:
@@ -215,17 +245,18 @@ class _Reader:
         return self.data[start:end].decode("utf-8")
 
 
-def _binary_cameras(path: Path) -> Iterator[tuple[int, _Lens]]:
+def _binary_cameras(path: Path) -> Iterator[tuple[int, _Entry]]:
     reader = _Reader(path)
     for _ in range(*reader.take("Q")):
         number, kind, width, height = reader.take("IiQQ")
-        if not 0 <= kind < len(_BINARY_MODELS):
+        if not 0 <= kind < len(COLMAP):
             raise InputError(
-                f"{path}: camera {number} has camera model number {kind}, which is not known ({', '.join(_PINHOLES)});"
+                f"{path}: camera {number} has camera model number {kind}, which is not known ({', '.join(COLMAP)});"
                 " undistort the images to a PINHOLE model."
             )
-        model = _BINARY_MODELS[kind]
-        yield number, _Lens(model, (width, height), reader.take(f"{len(_PARAMETERS[model])}d"))
+        model = tuple(COLMAP)[kind]
+        count = (3 if model in _ONE_FOCAL else 4) + len(COLMAP[model])
+        yield number, _Entry(model, (width, height), reader.take(f"{count}d"))
     reader.finish()
 
 

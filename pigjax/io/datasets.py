@@ -13,12 +13,11 @@ from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
 from pigjax.core.views import Views
-from pigjax.io.cameras import load_cameras, load_views
+from pigjax.io.cameras import load_cameras, load_view_masks, load_views, read_capture
 from pigjax.io.capture import without_suffix
 from pigjax.io.files import PathLike, decoding, existing, existing_folder, read_json
 from pigjax.io.images import open_image
-from pigjax.io.mask_json import ID_LIMIT, frame_order
-from pigjax.io.masks import load_masks
+from pigjax.io.mask_json import ID_LIMIT
 from pigjax.io.origin import Origin
 
 Truth = Bool[np.ndarray, "_ _"]  # of the size that it is stored in
@@ -35,6 +34,7 @@ class Dataset(NamedTuple):
     truths: dict[tuple[str, str], Truth]  # by (view, prompt)
     names: dict[int, str]  # names of the ids in `masks`, where the data set has them
     black: tuple[str, ...]  # views that do not vote and truths that are not scored, since they are black all over
+    valid: Bool[np.ndarray, "t h w"] | None = None  # pixels of `masks` that count; None: all
 
 
 class _Truths(NamedTuple):
@@ -50,6 +50,7 @@ def load_dataset(
     path: PathLike,
     layout: str,
     *,
+    images: PathLike | None = None,
     masks: PathLike | None = None,
     vote: bool = True,
     max_size: int | None = None,
@@ -73,6 +74,7 @@ def load_dataset(
     Args:
         path: folder of the scene, with cameras that `load_views` knows.
         layout: "lerf-mask", "3d-ovs" or "views".
+        images: folder of the photos, as `load_views` takes it.
         masks: folder or JSON of the masks that vote (see `load_masks`); `object_mask` of the scene if not given.
         vote: False leaves them unread.
         max_size: shrink photos so that neither side is longer [px].
@@ -87,24 +89,32 @@ def load_dataset(
     if layout not in LAYOUTS:
         raise InputError(f"format = {layout!r}: choose from {', '.join(LAYOUTS)}.")
     root = existing_folder(path, "data set")
-    cameras, views = load_cameras(root, max_size=max_size, origin=origin)
-    found = LAYOUTS[layout](root, sorted(views), origin)
+    cameras, views = load_cameras(root, images=images, max_size=max_size, origin=origin)
+    if layout != "views":
+        bent = next((shot for shot in read_capture(root, images, None).shots if shot.lens is not None), None)
+        if bent is not None:
+            raise InputError(
+                f"{bent.where}: its lens bends lines, and truth masks of {layout} are of pinholes; undistort."
+            )
+    found = LAYOUTS[layout](root, sorted(views), images, origin)
     truths = {key: mask for key, mask in found.masks.items() if mask.any()}
     if not truths:
         raise InputError(f"{root}: no truth mask of its {len(found.masks)} shows anything; check the test views.")
     black = [f"truth {view}/{prompt}" for view, prompt in found.masks if (view, prompt) not in truths]
     with_truth = {view for view, _ in truths}
-    test = load_views(root, only=[view for view in views if view in with_truth], max_size=max_size, origin=origin)
+    shown = [view for view in views if view in with_truth]
+    test = load_views(root, images=images, only=shown, max_size=max_size, origin=origin)
     names = found.names if masks is None else {}
     if not vote:
         return Dataset(None, None, test, truths, names, tuple(black))
     voters = [i for i, view in enumerate(views) if view not in found.test]
-    ids = load_masks(
+    ids, valid = load_view_masks(
+        root,
         root / "object_mask" if masks is None else masks,
         [views[i] for i in voters],
-        (cameras.width, cameras.height),
+        images=images,
+        max_size=max_size,
         holes=holes,
-        frames=frame_order(views),
         missing="empty",
     )
     says = np.any(ids, (1, 2))
@@ -113,7 +123,8 @@ def load_dataset(
             f"{root}: all masks of the {len(voters)} training views are black or missing; nothing can vote."
         )
     black += [f"view {views[i]}" for i, speaks in zip(voters, says.tolist()) if not speaks]
-    return Dataset(cameras[np.array(voters)[says]], ids[says], test, truths, names, tuple(black))
+    counted = None if valid is None else valid[says]
+    return Dataset(cameras[np.array(voters)[says]], ids[says], test, truths, names, tuple(black), counted)
 
 
 def load_names(path: PathLike) -> dict[int, str]:
@@ -153,7 +164,7 @@ def id_named(name: str, names: Mapping[int, str]) -> int | None:
     return found[0] if found else None
 
 
-def _lerf_mask(root: Path, views: Sequence[str], origin: Origin | None) -> _Truths:
+def _lerf_mask(root: Path, views: Sequence[str], images: PathLike | None, origin: Origin | None) -> _Truths:
     truths = existing_folder(root / "test_mask", "folder of truth masks (LERF-Mask)")
     folders = sorted(folder for folder in truths.iterdir() if folder.is_dir())
     train = root / "images_train"
@@ -181,7 +192,7 @@ def _view_of(folder: Path, views: Sequence[str], test: Sequence[str]) -> str:
     raise InputError(f"{folder}: is no view: neither a name nor a number from 0 to {len(test) - 1} of the test views.")
 
 
-def _3d_ovs(root: Path, views: Sequence[str], origin: Origin | None) -> _Truths:
+def _3d_ovs(root: Path, views: Sequence[str], images: PathLike | None, origin: Origin | None) -> _Truths:
     truths = existing_folder(root / "segmentations", "folder of truth masks (3D-OVS)")
     listing = existing(truths / "classes.txt", "list of classes")
     with decoding(listing, "list of classes", remedy="write it in UTF-8"):
@@ -200,9 +211,9 @@ def _3d_ovs(root: Path, views: Sequence[str], origin: Origin | None) -> _Truths:
     return _Truths([view for view, _ in masks], masks, {})
 
 
-def _labelled_views(root: Path, views: Sequence[str], origin: Origin | None) -> _Truths:
+def _labelled_views(root: Path, views: Sequence[str], images: PathLike | None, origin: Origin | None) -> _Truths:
     names = load_names(root / "names.json")
-    test = load_views(root, masks=True, split="test", origin=origin)
+    test = load_views(root, images=images, masks=root / "object_mask", split="test", origin=origin)
     assert test.masks is not None
     masks = {
         (view, name): np.asarray(mask) == number
@@ -213,7 +224,7 @@ def _labelled_views(root: Path, views: Sequence[str], origin: Origin | None) -> 
     return _Truths(list(test.names), masks, names)
 
 
-LAYOUTS: dict[str, Callable[[Path, Sequence[str], Origin | None], _Truths]] = {
+LAYOUTS: dict[str, Callable[[Path, Sequence[str], PathLike | None, Origin | None], _Truths]] = {
     "lerf-mask": _lerf_mask,
     "3d-ovs": _3d_ovs,
     "views": _labelled_views,

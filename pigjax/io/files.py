@@ -171,6 +171,18 @@ def write_text(path: PathLike, text: str) -> None:
         partial.write_bytes(_whole_text(text).encode())
 
 
+def toml_text(content: Any) -> str:
+    """Nested dicts of strings, numbers and lists as TOML.
+
+    Raises:
+        InputError: something in it has no TOML form.
+    """
+    try:
+        return tomli_w.dumps(content)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"content has no TOML form ({reason_of(error)}); give plain numbers or text.") from error
+
+
 def write_toml(path: PathLike, content: Any) -> None:
     """Write nested dicts of strings, numbers and lists as TOML; characters beyond UTF-8 become U+FFFD, with a warning.
 
@@ -178,11 +190,9 @@ def write_toml(path: PathLike, content: Any) -> None:
         InputError: the file cannot be written, or something in it has no TOML form.
     """
     try:
-        text = tomli_w.dumps(content)
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"{path}: content has no TOML form ({reason_of(error)}); give plain numbers or text."
-        ) from error
+        text = toml_text(content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error.__cause__
     if _whole_text(text) != text:
         warnings.warn(f"{path}: a path in it is not UTF-8, as TOML asks; rename that folder.", stacklevel=2)
     write_text(path, text)

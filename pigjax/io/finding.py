@@ -44,7 +44,8 @@ def find_parts(path: PathLike) -> Found:
     if path.is_file() and path.suffix.lower() in SPLATS:
         return Found(path, None, None, None, 0, None)
     folder = path if path.is_dir() else path.parent
-    views, problem = path, None
+    views: Path | None = path
+    problem = None
     try:
         load_cameras(path)
     except InputError as error:

@@ -1,6 +1,8 @@
-"""Gaussians in whatever file people have them: `.ply`, compressed `.ply`, `.splat`, `.spz`."""
+"""Gaussians in whatever file people have them: `.ply`, `.splat`, `.spz`, `.sog`, `.glb`, USD."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -8,19 +10,23 @@ from pigjax.core.arguments import checked
 from pigjax.core.errors import InputError
 from pigjax.core.gaussians import SH_CONSTANT, Gaussians
 from pigjax.io.files import PathLike, decoding, existing
+from pigjax.io.gltf import read_glb
 from pigjax.io.origin import Origin, fits_float32, proper_origin
 from pigjax.io.packed import read_spz
 from pigjax.io.ply import gaussians_of, read_ply, read_positions, warn_of_dropped
+from pigjax.io.sog import read_sog
+from pigjax.io.usd import SUFFIXES, read_usd
 
 _SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
 
 @checked
 def load_gaussians(path: PathLike, *, drop_invalid: bool = False, origin: Origin | None = None) -> Gaussians:
-    """Gaussians from `.ply` (INRIA's layout or PlayCanvas' compressed one), `.splat` or `.spz`. Host.
+    """Gaussians from `.ply` (INRIA's layout or PlayCanvas' compressed one), `.splat`, `.spz`, `.sog`, `.glb` or USD.
 
-    Compressed `.ply` and `.spz` are decoded by the package gsply: `pip install 'pigjax[formats]'`. These formats and
-    `.splat` store rounded numbers, and `.splat` no view-dependent colour. Axes are taken as the file has them: some
+    Compressed `.ply` and `.spz` are decoded by the package gsply (`pip install 'pigjax[formats]'`), USD by usd-core
+    (`pip install 'pigjax[usd]'`; the first frame). Host. Compressed `.ply`, `.spz`, `.sog` and `.splat` store rounded
+    numbers, and `.splat` no view-dependent colour. Axes are taken as the file has them: y points up in `.glb`, and some
     writers of `.spz` turn y and z.
 
     Args:
@@ -51,10 +57,11 @@ def read_gaussians(
     suffix = existing(path, "file of Gaussians").suffix.lower()
     if suffix == ".ply":
         return read_ply(path, drop_invalid=drop_invalid, origin=origin)
-    readers = {".splat": _read_splat, ".spz": read_spz}
-    if suffix not in readers:
-        raise InputError(f"{path}: unknown kind of file '{suffix}'; give a .ply, .splat or .spz.")
-    return gaussians_of(path, readers[suffix](path), drop_invalid=drop_invalid, origin=origin)
+    if suffix not in _READERS:
+        if suffix == ".ksplat":
+            raise InputError(f"{path}: .ksplat is not read; save it as .ply (by SuperSplat or splat-transform).")
+        raise InputError(f"{path}: unknown kind of file '{suffix}'; give a .ply, {', '.join(_READERS)}.")
+    return gaussians_of(path, _READERS[suffix](path), drop_invalid=drop_invalid, origin=origin)
 
 
 @checked
@@ -71,8 +78,7 @@ def origin_of(path: PathLike) -> tuple[float, float, float]:
         InputError: the file is damaged.
     """
     suffix = existing(path, "file of points or Gaussians").suffix.lower()
-    readers = {".splat": _read_splat, ".spz": read_spz}
-    read = readers.get(suffix)
+    read = _READERS.get(suffix)
     positions = read_positions(path) if read is None else read(path)["means"].astype(np.float64)
     if fits_float32(positions):
         return 0.0, 0.0, 0.0
@@ -102,3 +108,12 @@ def _read_splat(path: PathLike) -> dict[str, np.ndarray]:
         "quats": record["quats"] / 128.0 - 1.0,
     }
     return {name: values.astype(np.float32) for name, values in fields.items()}
+
+
+_READERS: dict[str, Callable[[PathLike], dict[str, np.ndarray]]] = {
+    ".splat": _read_splat,
+    ".spz": read_spz,
+    ".sog": read_sog,
+    ".glb": read_glb,
+    **dict.fromkeys(SUFFIXES, read_usd),
+}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -130,6 +132,19 @@ def open_rgb(
     return image.convert("RGB")
 
 
+def upright_size(path: PathLike) -> tuple[int, int]:
+    """Width and height [px] of a picture once it is turned as its EXIF says; it is not decoded.
+
+    Raises:
+        MissingFileError: there is no such file.
+        InputError: the file is not a picture.
+    """
+    path = existing(path, "image")
+    with _decoding(path), _opened(path) as image:
+        width, height = image.size
+        return (height, width) if image.getexif().get(_ORIENTATION, 1) >= _SIDEWAYS else (width, height)
+
+
 def turned_by_exif(path: PathLike) -> bool:
     """Whether EXIF asks to turn or mirror a picture, and the picture's size does not show whether that was done.
 
@@ -145,8 +160,8 @@ def turned_by_exif(path: PathLike) -> bool:
 
 def _wrong_size(path: PathLike, stored: tuple[int, ...], size: tuple[int, int], camera: str) -> InputError:
     return InputError(
-        f"{path}: image is {stored[0]}x{stored[1]} but its camera ({camera}) says {size[0]}x{size[1]}; give the photos"
-        " the cameras were made for (max_size shrinks them)."
+        f"{path}: image is {stored[0]}x{stored[1]} but its camera ({camera}) says {size[0]}x{size[1]}, another aspect"
+        " ratio; give the photos that the cameras were made for, turned as they were then (max_size shrinks them)."
     )
 
 
@@ -170,6 +185,17 @@ def write_image(path: PathLike, image: Picture) -> None:
             pixels.save(partial)
         except ValueError as error:
             raise InputError(f"{path}: {error}; use a suffix such as .png or .jpg.") from None
+
+
+def data_uri(image: Picture) -> str:
+    """A picture in RGB or grey as the address of itself, a JPEG, to lie within a page.
+
+    Raises:
+        InputError: the array is no picture.
+    """
+    room = io.BytesIO()
+    Image.fromarray(rgb_uint8(image)).save(room, "jpeg", quality=88)
+    return f"data:image/jpeg;base64,{base64.b64encode(room.getvalue()).decode()}"
 
 
 @checked

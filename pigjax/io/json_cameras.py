@@ -15,24 +15,26 @@ from pigjax.io.capture import (
     Capture,
     Shot,
     check_intrinsics,
-    check_pinhole,
+    check_lens,
     find_images,
     is_of_lens,
     normal_path,
+    read_lens,
     rigid,
     without_suffix,
 )
 from pigjax.io.files import decoding, read_json
 from pigjax.io.images import image_size
+from pigjax.io.lenses import COLMAP
 
-_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+_MODELS = ("PERSPECTIVE", *COLMAP)
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _SPLITS = ("train", "val", "test")
 # Fields that change no picture: the poses hold applied_* already, and no reader here moves, scales or crops the scene.
 _HARMLESS = frozenset((
     "aabb", "aabb_scale", "applied_scale", "applied_transform", "auto_scale_poses_override", "bbox", "camera_id",
     "camera_label", "colmap_im_id", "colmap_image_id", "depth_file_path", "depth_path", "depth_unit_scale_factor",
-    "enable_depth_loading", "enable_ray_loading", "far", "fisheye_crop_radius", "frame_id", "from_na", "id",
+    "blur_score", "enable_depth_loading", "enable_ray_loading", "far", "frame_id", "from_na", "id",
     "image_id", "img_name", "integer_depth_scale", "metadata", "n_frames", "name", "near", "normal_file_path",
     "offset", "orientation_override", "render_aabb", "rotation", "scale", "semantics_file_path", "sharpness", "time",
     "timestamp", "up",
@@ -53,13 +55,14 @@ class _Intrinsics(msgspec.Struct, kw_only=True):
     camera_angle_y: float | None = None
     x_fov: float | None = None
     y_fov: float | None = None
+    mask_path: str | None = None
+    fisheye_crop_radius: float | None = None
 
 
 class _Frame(_Intrinsics, kw_only=True):
     file_path: str
     transform_matrix: list[list[float]]
     split: str | None = None
-    mask_path: str | None = None
 
 
 class _Transforms(_Intrinsics, kw_only=True):
@@ -88,8 +91,8 @@ def read_transforms(path: Path, *, images: Path | None = None, split: str | None
 
     Raises:
         MissingFileError: there is no such file.
-        InputError: a field is missing or wrong, the camera is no pinhole, a pose is not rigid, or the lists of file
-            names name a photo that no frame has, or one photo for training and for testing.
+        InputError: a field is missing or wrong, the camera model is not known, a pose is not rigid, or the lists of
+            file names name a photo that no frame has, or one photo for training and for testing.
     """
     raw = read_json(path)
     content = _convert(raw, _Transforms, path)
@@ -99,12 +102,19 @@ def read_transforms(path: Path, *, images: Path | None = None, split: str | None
         )
         splits = _listed_splits(content, path)
         shared = {key: value for key, value in raw.items() if key != "frames"}
+        keeps = (
+            path.parent / normal_path(name) if (name := frame.mask_path or content.mask_path) else None
+            for frame in content.frames
+        )
         shots = tuple(
-            _nerfstudio_shot(frame, content, shared | own, photo, f"{path}: frames[{index}]", listed or split)
-            for index, (frame, own, photo, listed) in enumerate(zip(content.frames, _own(raw), photos, splits))
+            _nerfstudio_shot(frame, content, shared | own, photo, keep, f"{path}: frames[{index}]", listed or split)
+            for index, (frame, own, photo, keep, listed) in enumerate(
+                zip(content.frames, _own(raw), photos, keeps, splits)
+            )
         )
         points = path.parent / content.ply_file_path if content.ply_file_path else None
-        return Capture(path.parent, shots, points, _remarks(raw, content, path))
+        remarks = _unknown(path, [raw], _Transforms, _Frame) + _unknown(path, raw["frames"], _Frame)
+        return Capture(path.parent, shots, points, tuple(dict.fromkeys(remarks)))
 
 
 def read_inria_cameras(path: Path, *, images: Path | None = None) -> Capture:
@@ -114,7 +124,7 @@ def read_inria_cameras(path: Path, *, images: Path | None = None) -> Capture:
 
     Raises:
         MissingFileError: there is no such file.
-        InputError: a field is missing or wrong, the camera is no pinhole, or a pose is not rigid.
+        InputError: a field is missing or wrong, the camera model is not known, or a pose is not rigid.
     """
     raw = read_json(path)
     cameras = _convert(raw, list[_InriaCamera], path)
@@ -143,7 +153,7 @@ def _own(raw: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _inria_shot(camera: _InriaCamera, raw: dict[str, Any], photo: Path, where: str) -> Shot:
-    check_pinhole(camera.camera_model or "PINHOLE", raw, where, _MODELS)
+    lens = read_lens(camera.camera_model or "PINHOLE", raw, where, _MODELS)
     if len(camera.position) != 3 or [len(row) for row in camera.rotation] != [3, 3, 3]:
         raise InputError(f"{where}.rotation: has shape other than 3x3, or position has not 3 numbers; mend the entry.")
     pose = [[*row, shift] for row, shift in zip(camera.rotation, camera.position)]
@@ -151,17 +161,24 @@ def _inria_shot(camera: _InriaCamera, raw: dict[str, Any], photo: Path, where: s
     focal, size = (camera.fx, camera.fy), (camera.width, camera.height)
     centre = _centre((camera.cx, camera.cy), size)
     check_intrinsics(focal, centre, size, where)
-    return Shot(where, photo, np.linalg.inv(cam_to_world), focal, centre, size)
+    check_lens(lens, focal, centre, size, where)
+    return Shot(where, photo, np.linalg.inv(cam_to_world), focal, centre, size, lens=lens)
 
 
 def _nerfstudio_shot(
-    frame: _Frame, shared: _Transforms, fields: Mapping[str, Any], photo: Path, where: str, listed: str | None
+    frame: _Frame,
+    shared: _Transforms,
+    fields: Mapping[str, Any],
+    photo: Path,
+    keep: Path | None,
+    where: str,
+    listed: str | None,
 ) -> Shot:
     def pick(name: str) -> Any:
         own = getattr(frame, name)
         return getattr(shared, name) if own is None else own
 
-    check_pinhole(pick("camera_model") or "PINHOLE", fields, where, _MODELS)
+    lens = read_lens(pick("camera_model") or "PINHOLE", fields, where, _MODELS)
     cam_to_world = rigid(frame.transform_matrix, f"{where}.transform_matrix")
     width, height = size = image_size(photo) if None in (pick("w"), pick("h")) else (pick("w"), pick("h"))
     focal, upright = (_focal((frame, shared), axis, side, where) for axis, side in (("x", width), ("y", height)))
@@ -170,8 +187,12 @@ def _nerfstudio_shot(
     focals = (focal, focal if upright is None else upright)
     centre = _centre((pick("cx"), pick("cy")), size)
     check_intrinsics(focals, centre, size, where)
+    check_lens(lens, focals, centre, size, where)
+    circle = pick("fisheye_crop_radius")
+    if circle is not None and not 1 <= circle <= 1e6:
+        raise InputError(f"{where}: fisheye_crop_radius = {circle}: give the radius of the picture in pixels.")
     world_to_cam = _OPENGL_TO_OPENCV @ np.linalg.inv(cam_to_world)
-    return Shot(where, photo, world_to_cam, focals, centre, size, frame.split or listed)
+    return Shot(where, photo, world_to_cam, focals, centre, size, frame.split or listed, lens, keep, circle)
 
 
 def _centre(given: tuple[float | None, float | None], size: tuple[int, int]) -> tuple[float, float]:
@@ -231,18 +252,6 @@ def _listed_splits(content: _Transforms, path: Path) -> list[str | None]:
 
 def _is_relative(name: str) -> bool:
     return not name.startswith(("/", "\\")) and name[1:2] != ":"
-
-
-def _remarks(raw: dict[str, Any], content: _Transforms, path: Path) -> tuple[str, ...]:
-    masked = [frame for frame in content.frames if frame.mask_path]
-    said = _unknown(path, [raw], _Transforms, _Frame) + _unknown(path, raw["frames"], _Frame)
-    if masked or raw.get("mask_path"):
-        said += (
-            f"{path}: mask_path of {len(masked)} of {len(content.frames)} frames is not applied: the pixels that it"
-            " leaves out are fitted and vote like others. Make them transparent in the photos (RGBA), or give instance"
-            " masks and fit one object.",
-        )
-    return tuple(dict.fromkeys(said))
 
 
 def _unknown(path: Path, entries: Sequence[Mapping[str, Any]], *kinds: type[msgspec.Struct]) -> tuple[str, ...]:

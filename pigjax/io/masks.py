@@ -124,6 +124,33 @@ def save_masks(folder: PathLike, names: Sequence[str], masks: Integer[np.ndarray
             Image.fromarray(mask.astype(np.uint8 if high < 256 else np.uint16)).save(partial)
 
 
+def load_stroke(path: PathLike, size: tuple[int, int]) -> Int[np.ndarray, "h w"]:
+    """A stroke painted on a black or transparent picture: 1 the object, 2 something else, 0 nothing. Host.
+
+    In a colour picture red (more red than green and blue together) is something else and any other colour the object;
+    in a picture of one channel the value 2 is something else and any other than 0 the object.
+
+    Args:
+        path: of the picture.
+        size: width and height of its view [px]; another size of the same aspect is resized by nearest pixel.
+
+    Raises:
+        MissingFileError: there is no such file.
+        InputError: the picture is damaged, has another aspect ratio than the view, or nothing is painted on it.
+    """
+    picture = open_image(path, check=lambda width, height: _check_size(Path(path), (height, width), size[::-1]))
+    if picture.mode in ("L", "P", "1") or picture.mode.startswith("I"):
+        values = np.asarray(picture).astype(np.int32)
+        strokes = np.where(values == 2, 2, (values != 0).astype(np.int32))
+    else:
+        red, green, blue, alpha = np.moveaxis(np.asarray(picture.convert("RGBA")).astype(np.int32), -1, 0)
+        painted = (alpha > 127) & (red + green + blue > 96)
+        strokes = np.where(painted, np.where(red > green + blue, 2, 1), 0)
+    if not (strokes == 1).any():
+        raise InputError(f"{path}: nothing is painted on it; paint over the object on black or transparent ground.")
+    return _nearest(strokes.astype(np.int32), size)
+
+
 def _missing(folder: PathLike, name: str) -> MissingFileError:
     return MissingFileError(
         f"{folder}: no mask for view '{name}' ({name}.png or {name}.npy) nor in JSON; add it, or let it be 'empty'."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ from jaxtyping import Float
 
 from pigjax.core.arguments import checked
 from pigjax.core.errors import InputError
-from pigjax.core.gaussians import Gaussians
+from pigjax.core.gaussians import Gaussians, Splats
+from pigjax.core.placing import as_gaussians, placed, points_placed
 from pigjax.io.colmap import read_points3d
 from pigjax.io.files import PathLike, existing, writing
 from pigjax.io.origin import Origin, shifted, unshifted
@@ -183,6 +185,26 @@ def gaussians_of(
     return Gaussians(**{name: jnp.asarray(array, jnp.float32) for name, array in values.items()}), total - count
 
 
+def fields_of(parts: Sequence[tuple[Gaussians, Float[np.ndarray, "4 4"]]]) -> Columns:
+    """Columns of each field of Gaussians that are placed by a transform each, one after the other.
+
+    Positions come in float64, as a transform may put them far from the origin. Of different degrees of colour the least
+    is kept.
+    """
+    placed_parts = [placed(gaussians, transform) for gaussians, transform in parts]
+    bands = min(part.sh.shape[1] for part in placed_parts)
+    sh = np.concatenate([np.asarray(part.sh)[:, :bands] for part in placed_parts])
+    names = ("log_scales", "quats", "logit_opacities")
+    columns = {name: np.concatenate([np.asarray(getattr(part, name)) for part in placed_parts]) for name in names}
+    return {
+        **columns,
+        "means": np.concatenate([points_placed(np.asarray(part.means), transform) for part, transform in parts]),
+        "logit_opacities": columns["logit_opacities"][:, None],
+        "sh_0": sh[:, 0],
+        "sh_rest": sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1),
+    }
+
+
 def _filtered(path: PathLike, kept: Columns) -> Columns:
     """Scales and opacities with Mip-Splatting's 3D filter folded in (Yu et al. 2024, eq. 9): s' = √(s² + f²), and
     opacities times √(Π s² / Π s'²), in logarithms so that nothing overflows."""
@@ -209,18 +231,22 @@ def warn_of_dropped(path: PathLike, dropped: int) -> None:
 
 
 @checked
-def save_ply(path: PathLike, gaussians: Gaussians, *, ascii: bool = False, origin: Origin | None = None) -> None:
-    """Write Gaussians in INRIA's PLY layout (3DGS) in float32, with zero normals. Host.
+def save_ply(
+    path: PathLike, gaussians: Gaussians | Splats, *, ascii: bool = False, origin: Origin | None = None
+) -> None:
+    """Write Gaussians or posed splats in INRIA's PLY layout (3DGS) in float32, with zero normals. Host.
 
     Args:
         path: the file.
-        gaussians: the scene; positions in m.
+        gaussians: the scene, or splats that are posed (`as_gaussians` makes rotations and scales of their factors);
+            positions in m.
         ascii: as text, which people can read, instead of binary.
         origin: offset that `load_gaussians` subtracted, added to the positions [m], which are then written in float64.
 
     Raises:
         InputError: the file cannot be written, or `origin` is no point.
     """
+    gaussians = as_gaussians(gaussians)
     sh = np.asarray(gaussians.sh, np.float32)
     count, bands, _ = sh.shape
     fields: dict[str, Any] = {

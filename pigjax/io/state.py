@@ -27,6 +27,7 @@ from pigjax.io.provenance import Parts, check_same
 
 _SIGNATURE = "signature"
 STATES = "[0-9]" * 6 + "*.npz"  # pattern of files of `save_state`, and of no others
+ROWS = "particles.npz"  # what belongs to each row of the states of all frames
 Tree = TypeVar("Tree")
 
 
@@ -78,6 +79,37 @@ def load_state(
 
 def _single(values: np.ndarray) -> np.ndarray:
     return values.astype(np.float32) if values.dtype == np.float16 else values
+
+
+def save_rows(folder: PathLike, arrays: Mapping[str, Shaped[np.ndarray | Array, "..."]], *, signature: str) -> Path:
+    """Write what belongs to each row of all states of a run, once, as `particles.npz`, and give its path. Host.
+
+    Args:
+        folder: of the states.
+        arrays: the Gaussian, the object, the mass, ... of each row, by name.
+        signature: of the run, as for `save_state`.
+
+    Raises:
+        InputError: an array is named "signature", or the folder cannot be written.
+    """
+    path = Path(folder) / ROWS
+    if _SIGNATURE in arrays:
+        raise InputError(f"{path}: an array is named {_SIGNATURE!r}, which is taken; give it another name.")
+    save_arrays(path, {_SIGNATURE: np.asarray(signature), **arrays})
+    return path
+
+
+def load_rows(folder: PathLike, *, signature: str | None = None) -> dict[str, np.ndarray]:
+    """The arrays of `save_rows`. Host.
+
+    Raises:
+        MissingFileError: there is no such file.
+        StaleError: it belongs to a run with another signature.
+        InputError: the file is damaged.
+    """
+    rows = _read(existing(Path(folder) / ROWS, "file of particles"))
+    _check_signature(Path(folder) / ROWS, rows, signature)
+    return {name: values for name, values in rows.items() if name != _SIGNATURE}
 
 
 def last_state(folder: PathLike, *, signature: str) -> int | None:

@@ -25,9 +25,11 @@ from PIL import Image
 from pigjax.core.arguments import checked
 from pigjax.core.errors import InputError
 from pigjax.io.files import PathLike, existing, writing
-from pigjax.io.images import rgb_uint8
+from pigjax.io.images import rgb_uint8, to_uint8
 
 _H264 = ["-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+# constant quality; "-auto-alt-ref 0": its hidden frames have no transparency
+_VP9 = ["-c:v", "libvpx-vp9", "-crf", "24", "-b:v", "0", "-deadline", "good", "-cpu-used", "4", "-auto-alt-ref", "0"]
 # Tagged, since players guess the colours of untagged film by its size.
 _BT709 = ["-vf", "scale=out_color_matrix=bt709:out_range=tv"]
 _BT709 += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"]
@@ -43,27 +45,29 @@ _HELD = 0.01  # share that a GIF's rate may be off without a warning
 
 @checked
 def write_video(path: PathLike, frames: Iterable[Any], *, fps: float | int) -> None:
-    """Write frames in 0..1 (or uint8) to `.mp4` (H.264, yuv420p) or to a looping `.gif`. Host.
+    """Write frames in 0..1 (or uint8) to `.mp4` (H.264, yuv420p), `.webm` (VP9) or to a looping `.gif`. Host.
 
     Frames are taken one at a time, so a generator keeps memory small. H.264 needs even sizes: an odd edge is repeated
-    once. The frames of a GIF last whole hundredths of a second, two at least since browsers show shorter ones slowly:
-    1 / fps is rounded to that, and a warning says so where the rate is off by more than 1 %.
+    once. Pictures with alpha, which is not multiplied into their colours, stay transparent, in `.webm` alone. The
+    frames of a GIF last whole hundredths of a second, two at least since browsers show shorter ones slowly: 1 / fps is
+    rounded to that, and a warning says so where the rate is off by more than 1 %.
 
     Args:
-        path: `.mp4` or `.gif`, in any folder; missing folders are made.
-        frames: pictures [h w 3] or [h w], or arrays [t h w 3] or [t h w] of them.
+        path: `.mp4`, `.webm` or `.gif`, in any folder; missing folders are made.
+        frames: pictures [h w 3] or [h w], or arrays [t h w 3] or [t h w] of them; for `.webm` [h w 4], too.
         fps: frames a second.
 
     Raises:
         InputError: unknown suffix, fps not finite and positive, no frames, an array is no picture, frames of different
             sizes, or the file cannot be written.
     """
-    encode = {".mp4": _write_mp4, ".gif": _write_gif}.get(Path(path).suffix.lower())
+    suffix = Path(path).suffix.lower()
+    encode = {".mp4": _write_mp4, ".webm": _write_webm, ".gif": _write_gif}.get(suffix)
     if encode is None:
-        raise InputError(f"{path}: unknown video suffix {Path(path).suffix!r}; use .mp4 or .gif.")
+        raise InputError(f"{path}: unknown video suffix {Path(path).suffix!r}; use .mp4, .webm or .gif.")
     if isinstance(fps, bool) or not isinstance(fps, Real) or not 0 < fps < math.inf:
         raise InputError(f"{path}: fps = {fps!r}; it must be > 0, and finite.")
-    pixels = _checked(frames, path)
+    pixels = _checked(frames, path, alpha=suffix == ".webm")
     first = next(pixels, None)
     if first is None:
         raise InputError(f"{path}: no frames were given; give at least one.")
@@ -94,8 +98,8 @@ def read_video(path: PathLike) -> Float[np.ndarray, "t h w 3"]:
     return frames[:, header.end() :].reshape(-1, height, width, 3).astype(np.float32) / 255
 
 
-def _checked(frames: Iterable[Any], path: PathLike) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """8-bit RGB of every frame, all of one size."""
+def _checked(frames: Iterable[Any], path: PathLike, *, alpha: bool) -> Iterator[UInt8[np.ndarray, "h w c"]]:
+    """8-bit RGB of every frame, or RGBA where there is `alpha`, all of one size."""
     shape = getattr(frames, "shape", None)
     if shape is not None and (len(shape) not in (3, 4) or (len(shape) == 3 and shape[-1] == 3)):
         raise InputError(f"{path}: frames has shape {tuple(shape)}; give pictures in a list, or [t, h, w, 3].")
@@ -103,7 +107,9 @@ def _checked(frames: Iterable[Any], path: PathLike) -> Iterator[UInt8[np.ndarray
         raise InputError(f"{path}: frames is a {type(frames).__name__}; give pictures [h, w, 3] in a list.")
     size = None
     for index, frame in enumerate(frames):
-        pixels = rgb_uint8(frame, name=f"{path}: frame {index}")
+        name = f"{path}: frame {index}"
+        clear = alpha and np.ndim(frame) == 3 and np.shape(frame)[-1] == 4
+        pixels = to_uint8(frame, name=name) if clear else rgb_uint8(frame, name=name)
         size = size or pixels.shape
         if pixels.shape != size:
             raise InputError(f"{path}: frame {index} is {pixels.shape[:2]}, the first {size[:2]} [h w].")
@@ -111,18 +117,30 @@ def _checked(frames: Iterable[Any], path: PathLike) -> Iterator[UInt8[np.ndarray
 
 
 def _write_mp4(path: Path, first: np.ndarray, rest: Iterator[np.ndarray], fps: float | int) -> None:
+    even = ((0, first.shape[0] % 2), (0, first.shape[1] % 2), (0, 0))
+    _encode(path, (np.pad(frame, even, mode="edge") for frame in chain([first], rest)), fps, _H264)
+
+
+def _write_webm(path: Path, first: np.ndarray, rest: Iterator[np.ndarray], fps: float | int) -> None:
+    pixels = "yuva420p" if first.shape[-1] == 4 else "yuv420p"
+    _encode(path, chain([first], rest), fps, [*_VP9, "-pix_fmt", pixels])
+
+
+def _encode(path: Path, frames: Iterator[np.ndarray], fps: float | int, codec: list[str]) -> None:
+    """Hand the frames to ffmpeg one by one."""
     import imageio_ffmpeg  # not at the top: it would slow down every import of pigjax
 
-    even = ((0, first.shape[0] % 2), (0, first.shape[1] % 2), (0, 0))
-    height, width = (extent + pad for extent, (_, pad) in zip(first.shape, even[:2]))
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps}", "-i", "pipe:0"]
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *_BT709, *_H264, f"file:{path}"]
+    first = next(frames)
+    height, width, channels = first.shape
+    kind = "rgba" if channels == 4 else "rgb24"
+    source = ["-f", "rawvideo", "-pix_fmt", kind, "-s", f"{width}x{height}", "-r", f"{fps}", "-i", "pipe:0"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *source, *_BT709, *codec, f"file:{path}"]
     # Not imageio's own writer: that forks, of which JAX warns, and leaves ffmpeg running where a frame fails.
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
         assert ffmpeg.stdin is not None
         with suppress(BrokenPipeError):  # ffmpeg gave up, and says why below
-            for frame in chain([first], rest):
-                ffmpeg.stdin.write(np.pad(frame, even, mode="edge").tobytes())
+            for frame in chain([first], frames):
+                ffmpeg.stdin.write(frame.tobytes())
         _, complaint = ffmpeg.communicate()
     if ffmpeg.returncode:
         raise OSError(f"ffmpeg: {complaint.decode(errors='replace').strip()}")

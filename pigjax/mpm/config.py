@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 
 from pigjax.core.arrays import static_field
+from pigjax.core.backend import BACKENDS, check_backend
 from pigjax.core.checks import LARGEST_WHOLE, Limits, check_fields
 from pigjax.core.errors import InputError
 from pigjax.mpm.grid import WALL
@@ -50,11 +51,18 @@ class SimConfig(eqx.Module):
     devices: int | None = static_field(default=None, limits=Limits(1, 100_000))
     # or "forward": for jvp, jacfwd and hessian
     differentiation: str = static_field(default="reverse", choices=_DIFFERENTIATION)
-    # particles handled at once; None: 512 on a CPU, else all
+    # particles handled at once by XLA; None: 512 on a CPU, else all. Warp handles all
     chunk: int | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
+    # of P2G and G2P: "xla", "warp" (extra `gpu`: CUDA devices and CPUs), or "auto": Warp on CUDA devices where it is
+    # installed
+    backend: str = static_field(default="auto", choices=BACKENDS)
+    # add the particles of a node in a fixed order, so that equal runs on one device give equal bits; a CPU always does
+    # under XLA. Warp sorts the particles at each P2G for it
+    deterministic: bool = static_field(default=False)
 
     def __check_init__(self) -> None:
         check_fields(self)
+        check_backend("SimConfig", self.backend, self.differentiation)
         if self.box is not None and not (
             isinstance(self.box, tuple)
             and len(self.box) == 3

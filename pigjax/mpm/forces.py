@@ -283,6 +283,14 @@ class Impulse(Force):
         share = self.acting(dt, time) / jnp.where(length > 0, length, 1.0)
         return matter.weight * (self.momentum * jnp.where(totals > 0, share / jnp.where(totals > 0, totals, 1.0), 0.0))
 
+    def speed_gain(self, particles: Particles, time: float, duration: float, reach: float) -> float:
+        """The speed that the whole momentum gives to the matter that it acts on now."""
+        share = np.asarray(self._share(particles), float)
+        mass = float((share[:, 0] * np.where(share[:, 0] > 0, np.asarray(particles.mass, float), 0.0)).sum())
+        if float(self.acting(duration, time)) <= 0 or mass <= 0:
+            return 0.0
+        return float(np.linalg.norm(np.asarray(self.momentum))) * float(share.max()) / mass
+
     @property
     def _start(self) -> Scalar | float:
         return 0.0 if self.start is None else self.start

@@ -15,6 +15,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.arrays import everywhere, in_precision
+from pigjax.core.backend import check_order, takes_warp
 from pigjax.core.errors import InputError
 from pigjax.core.regions import Region
 from pigjax.mpm import (
@@ -105,10 +106,13 @@ def run_frames(
             None: these are all.
 
     Raises:
-        InputError: the integrator is "auto".
+        InputError: the integrator is "auto", or the backend cannot do what the configuration asks for.
     """
     if config.integrator == "auto":
         raise InputError("SimConfig.integrator = 'auto' is undecided: take what choose_integrator finds.")
+    warp = takes_warp(config.backend, config.differentiation)
+    if config.deterministic:
+        check_order(warp)
     kernel, dtype = KERNELS[config.kernel], particles.x.dtype
     window, table, inputs = in_precision((window, table, inputs), dtype)
     grid, contact = window.grid, inputs.contact
@@ -149,6 +153,8 @@ def run_frames(
         axis=_AXIS if devices > 1 else None,
         fillers=sum(-len(part) % devices for part, moves in zip(grouping.parts, grouping.moves) if moves),
         force_columns=columns_of(inputs.forces),
+        warp=warp,
+        in_order=config.deterministic,
     )
     run = partial(_frames, statics, config, frames, inputs.substeps, of or frames)
     if devices > 1:
@@ -185,7 +191,7 @@ def _frames(
 
     def frame(carry, _):
         states, worst, steps, stopped = carry
-        chunks = tuple(to_chunks(state, config.chunk) for state in states)
+        chunks = tuple(to_chunks(state, len(state.cells) if statics.warp else config.chunk) for state in states)
         chunks, health = steps_of_frame(statics, substeps, of, context, start, chunks, steps)
         steps = steps + substeps
         moved = tuple(

@@ -1,8 +1,9 @@
 """One substep of MLS-MPM with APIC: `particles_to_grid` (P2G), `update_grid`, `grid_to_particles` (G2P).
 
 Forces on particles come before P2G (`apply_forces`). The same functions serve forward simulation and the adjoint, which
-keeps the grid between the first and the second. `reference.py` has the same stages under the same names in plain form,
-without forces, chunks or devices.
+keeps the grid between the first and the second. `StepStatics.warp` takes Warp kernels for the sums of P2G and G2P, and
+the same code for the rest. `reference.py` has the same stages under the same names in plain form, without forces,
+chunks or devices.
 """
 
 from __future__ import annotations
@@ -30,9 +31,12 @@ from pigjax.mpm.materials.tensors import determinant, product
 from pigjax.mpm.transfers import (
     CHANNELS,
     Kernel,
+    Moments,
     Stencil,
     Windows,
     affine_momentum,
+    as_channels,
+    distances,
     first_nodes,
     gather_window,
     gather_window_vjp,
@@ -59,6 +63,8 @@ class StepStatics(NamedTuple):
     axis: str | None  # name of the devices that share the particles
     fillers: int  # particles without mass that even out the devices' shares
     force_columns: tuple[int | None, ...] = ()  # row of `State.weights` that each force reads
+    warp: bool = False  # whether the transfers are Warp kernels (`warp_transfers`), for all particles at once
+    in_order: bool = False  # whether these add to a node in a fixed order
 
 
 class StepContext(NamedTuple):
@@ -141,6 +147,9 @@ def particles_to_grid(statics: StepStatics, context: StepContext, states: tuple[
         total = jnp.zeros((*context.nodes, CHANNELS), context.dt.dtype)
         for state in states:
             chunks = (state.v, state.C, state.stress, state.mass, state.volume)
+            if statics.warp:
+                total = _scatter_all(statics, context, state.cells, chunks, total)
+                continue
             total = total + scatter_chunks(
                 loop, context.opaque_true, state.cells, chunks, shared, custom_vjp=statics.custom_vjp
             )
@@ -186,9 +195,12 @@ def grid_to_particles(
         loop = ChunkLoop(function, statics.kernel, context.nodes, counts_walls=inner is not None)
         shared = (context.dt, context.grid.dx, parameters, inner)
         with jax.named_scope("grid_to_particles"):
-            state, lanes = gather_chunks(
-                loop, context.opaque_true, velocity, state, shared, custom_vjp=statics.custom_vjp
-            )
+            if statics.warp:
+                state, lanes = _gather_all(statics, context, law, velocity, state, shared)
+            else:
+                state, lanes = gather_chunks(
+                    loop, context.opaque_true, velocity, state, shared, custom_vjp=statics.custom_vjp
+                )
         moved.append(state)
         own = lax.stop_gradient(lanes.of_step(context.dt / context.grid.dx))
         health = health.combine(own, counts=jnp.add)
@@ -199,6 +211,35 @@ def _scatter_chunk(
     statics: StepStatics, opaque_true: Bool[Array, ""], at: Stencil, chunk: tuple[Array, ...], shared: tuple[Array, ...]
 ) -> Windows:
     """Windows of a chunk."""
+    scatter = scatter_window_vjp if statics.custom_vjp else scatter_window
+    return scatter(statics.kernel, opaque_true, at, _momentum(statics, opaque_true, at.distance, chunk, shared))
+
+
+def _scatter_all(
+    statics: StepStatics,
+    context: StepContext,
+    cells: Float[Array, "n 3 c"],
+    chunks: tuple[Array, ...],
+    grid: Float[Array, "x y z 4"],
+) -> Float[Array, "x y z 4"]:
+    """The grid with the particles of all chunks added, by a Warp kernel."""
+    from pigjax.mpm.warp_transfers import add_to_grid
+
+    whole, *parts = (_joined(rows) for rows in (cells, *chunks))
+    distance = distances(whole, statics.kernel, context.nodes)
+    shared = (context.dt, context.grid.dx)
+    polynomial = _momentum(statics, context.opaque_true, distance, tuple(parts), shared)
+    return add_to_grid(statics.kernel, statics.in_order, whole, polynomial, grid)
+
+
+def _momentum(
+    statics: StepStatics,
+    opaque_true: Bool[Array, ""],
+    distance: Float[Array, "3 c"],
+    chunk: tuple[Array, ...],
+    shared: tuple[Array, ...],
+) -> Moments:
+    """Affine momentum of particles, in explicit steps with the impulse of their stress."""
     dt, dx = shared
 
     def momentum(distance, v, C, stress, mass, volume):
@@ -207,10 +248,8 @@ def _scatter_chunk(
             affine = affine - (dt * statics.kernel.inverse_inertia / dx) * volume * stress
         return affine_momentum(distance, mass[0], v, affine)
 
-    scatter = scatter_window_vjp if statics.custom_vjp else scatter_window
     v, C, stress, *others = chunk
-    polynomial = no_fuse(opaque_true, momentum, at.distance, v, by_component(C), by_component(stress), *others)
-    return scatter(statics.kernel, opaque_true, at, polynomial)
+    return no_fuse(opaque_true, momentum, distance, v, by_component(C), by_component(stress), *others)
 
 
 def _gather_chunk(
@@ -225,10 +264,54 @@ def _gather_chunk(
     shared: Any,
 ) -> tuple[State, LaneHealth]:
     """A chunk after the step, and its health."""
-    dt, dx, parameters, inner = shared
     gather = gather_window_vjp if statics.custom_vjp else gather_window
     moments = gather(statics.kernel, opaque_true, at, windows)
-    v, per_cell = no_fuse(opaque_true, partial(velocity_and_gradient, statics.kernel), at.distance, moments)
+    return _moved(statics, shape, bodies, law, opaque_true, at.distance, moments, state, shared)
+
+
+def _gather_all(
+    statics: StepStatics,
+    context: StepContext,
+    law: str,
+    velocity: Float[Array, "x y z 3"],
+    state: State,
+    shared: Any,
+) -> tuple[State, LaneHealth]:
+    """All chunks after the step, and their health, by a Warp kernel."""
+    from pigjax.mpm.warp_transfers import take_from_grid
+
+    count, nodes = len(state.cells), context.nodes
+    whole = jax.tree.map(_joined, state)
+    moments = take_from_grid(statics.kernel, statics.in_order, whole.cells, as_channels(velocity))
+    distance = distances(whole.cells, statics.kernel, nodes)
+    moved, health = _moved(statics, nodes, context.bodies, law, context.opaque_true, distance, moments, whole, shared)
+    return jax.tree.map(partial(_cut, count), moved), health
+
+
+def _joined(rows: Float[Array, "n r c"]) -> Float[Array, "r p"]:
+    """Rows of all chunks as one; a single chunk stays in place."""
+    return jnp.swapaxes(rows, 0, 1).reshape(rows.shape[1], -1)
+
+
+def _cut(chunks: int, rows: Float[Array, "r p"]) -> Float[Array, "n r c"]:
+    """Inverse of `_joined`."""
+    return jnp.swapaxes(rows.reshape(len(rows), chunks, -1), 0, 1)
+
+
+def _moved(
+    statics: StepStatics,
+    shape: tuple[int, int, int],
+    bodies: int,
+    law: str,
+    opaque_true: Bool[Array, ""],
+    distance: Float[Array, "3 c"],
+    moments: Moments,
+    state: State,
+    shared: Any,
+) -> tuple[State, LaneHealth]:
+    """Particles after the step from the moments of the grid around them, and their health."""
+    dt, dx, parameters, inner = shared
+    v, per_cell = no_fuse(opaque_true, partial(velocity_and_gradient, statics.kernel), distance, moments)
     with jax.named_scope("law"):
         arguments = by_components(state), v, per_cell, dt, dx, parameters
         new = in_rows(no_fuse(opaque_true, partial(_respond, law), *arguments))

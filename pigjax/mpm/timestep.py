@@ -88,6 +88,7 @@ def choose_integrator(
         frame_dt: duration of a frame [s].
         gravity: [m/s²].
         colliders: as they are at the start.
+        forces: beside gravity; the speed that they can give counts.
 
     Raises:
         InputError: a number is out of range, or no step is stable.

@@ -34,7 +34,7 @@ def lift(
         cameras: batch of posed views.
         masks: id of every pixel, 0 = background; ids may lie far apart.
         fill: give Gaussians that no view saw the id of their neighbours (`fill_unseen`).
-        settings: of `lift_masks`, except `num_ids`.
+        settings: of `lift_masks`, except `num_ids`; among them `valid`, the pixels that count.
 
     Returns:
         Labels whose `object_id` are the ids of the masks. Where these are not 0, 1, 2, ..., `Labels.ids` holds the id

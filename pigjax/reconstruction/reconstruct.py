@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from pigjax import io
 from pigjax.core.arguments import checked
@@ -173,14 +173,15 @@ def _mean(scores: dict[str, float]) -> float | None:
 
 def _photos(views: io.Views, config: FitConfig) -> Photos:
     images = jnp.asarray(views.images)
+    valid = None if views.valid is None else jnp.asarray(views.valid)
     if config.object_id is None and not config.random_background:
-        return Photos(images, None)
+        return Photos(images, None, valid)
     if views.masks is None:
         raise InputError(f"{_asked(config)} needs masks: load the views with load_views(..., masks=True).")
     masks = np.asarray(views.masks)
     matte = masks > 0 if config.object_id is None else masks == config.object_id
     mattes = jnp.asarray(matte[..., None], images.dtype)
-    return Photos(images * mattes, mattes)
+    return Photos(images * mattes, mattes, valid)
 
 
 def _asked(config: FitConfig) -> str:
@@ -189,16 +190,23 @@ def _asked(config: FitConfig) -> str:
     return f"FitConfig.object_id = {config.object_id}"
 
 
-def _scored(views: io.Views, config: FitConfig) -> tuple[tuple[str, ...], Camera, Float[Array, "v h w 3"]] | None:
-    """Names, cameras and pictures of the views that are scored: those whose masks show the fitted object."""
+Scored = tuple[tuple[str, ...], Camera, Float[Array, "v h w 3"], Bool[Array, "v h w"] | None]
+
+
+def _scored(views: io.Views, config: FitConfig) -> Scored | None:
+    """Names, cameras, pictures and valid pixels of the views that are scored: those that show the fitted object."""
     photos = _photos(views, config)
-    if photos.mattes is None:
-        return views.names, views.cameras, photos.images
-    seen = np.nonzero(np.asarray(photos.mattes).any((1, 2, 3)))[0]
+    shown = np.ones(len(views), bool) if photos.mattes is None else np.asarray(photos.mattes).any((1, 2, 3))
+    if photos.valid is not None:
+        shown &= np.asarray(photos.valid).any((1, 2))
+    seen = np.nonzero(shown)[0]
     if not len(seen):
         return None
-    images = photos.images + (1 - photos.mattes) * config.background
-    return tuple(views.names[k] for k in seen), views.cameras[seen], images[seen]
+    images = photos.images
+    if photos.mattes is not None:
+        images = images + (1 - photos.mattes) * config.background
+    valid = None if photos.valid is None else photos.valid[seen]
+    return tuple(views.names[k] for k in seen), views.cameras[seen], images[seen], valid
 
 
 def provenance(views: io.Views, config: FitConfig, points: Any) -> dict[str, str]:
@@ -215,7 +223,9 @@ def provenance(views: io.Views, config: FitConfig, points: Any) -> dict[str, str
     return io.parts_of(
         {
             "settings": settings,
-            "photos": io.digest(views.images, views.names, views.splits),
+            "photos": io.digest(
+                views.images, views.names, views.splits, *(() if views.valid is None else (views.valid,))
+            ),
             "cameras": io.digest(views.cameras),
             "masks": io.digest(views.masks),
             "points": io.digest(points),
@@ -265,22 +275,22 @@ def _next_multiple(step: int, *periods: int) -> int:
 
 
 def _score(
-    gaussians: Gaussians, held_out: tuple[tuple[str, ...], Camera, Array] | None, config: FitConfig
+    gaussians: Gaussians, held_out: Scored | None, config: FitConfig
 ) -> tuple[dict[str, float], dict[str, float]]:
     """PSNR [dB] and SSIM of each held-out view by name."""
     if held_out is None:
         return {}, {}
-    names, cameras, images = held_out
-    psnrs, ssims = _score_views(gaussians, cameras, images, config)
+    names, cameras, images, valid = held_out
+    psnrs, ssims = _score_views(gaussians, cameras, images, valid, config)
     return dict(zip(names, map(float, psnrs))), dict(zip(names, map(float, ssims)))
 
 
 @eqx.filter_jit
-def _score_views(gaussians: Gaussians, cameras: Camera, images, config: FitConfig):
-    def one(pair):
-        camera, image = pair
+def _score_views(gaussians: Gaussians, cameras: Camera, images, valid, config: FitConfig):
+    def one(view):
+        camera, image, counted = view
         rgb = render(gaussians, camera, config.render, background=config.background, outputs=("rgb",)).rgb
         rgb = jnp.clip(rgb, 0, 1)
-        return psnr(rgb, image), ssim(rgb, image)
+        return psnr(rgb, image, valid=counted), ssim(rgb, image, valid=counted)
 
-    return lax.map(one, (cameras, images))
+    return lax.map(one, (cameras, images, valid))

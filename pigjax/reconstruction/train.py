@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.arrays import static_field
 from pigjax.core.camera import Camera
@@ -94,6 +94,7 @@ class Photos(NamedTuple):
 
     images: Float[Array, "v h w 3"]
     mattes: Float[Array, "v h w 1"] | None
+    valid: Bool[Array, "v h w"] | None = None  # pixels that are fitted; None: all
 
 
 class FitState(eqx.Module):
@@ -204,9 +205,12 @@ def _loss(fitted, camera: Camera, photo: Photos, background, config: FitConfig, 
     frame = render(gaussians, camera, config.render, background=background, outputs=("rgb",))
     assert frame.rgb is not None
     image = photo.images if photo.mattes is None else photo.images + (1 - photo.mattes) * background
-    loss = (1 - config.ssim_weight) * jnp.mean(jnp.abs(frame.rgb - image))
+    rgb = frame.rgb
+    if photo.valid is not None:
+        rgb, image = (jnp.where(photo.valid[..., None], picture, 0.0) for picture in (rgb, image))
+    loss = (1 - config.ssim_weight) * jnp.mean(jnp.abs(rgb - image))
     if config.ssim_weight:
-        loss += config.ssim_weight * (1 - ssim(frame.rgb, image))
+        loss += config.ssim_weight * (1 - ssim(rgb, image))
     loss += config.opacity_regularizer * jnp.mean(jax.nn.sigmoid(gaussians.logit_opacities))
     loss += config.scale_regularizer / extent * jnp.mean(jnp.exp(gaussians.log_scales))
     return loss

@@ -150,7 +150,8 @@ def _value(value: Any, kind: Any, name: str) -> Any:
             raise SceneError(f"{name} = {shown(value)}: it must be a table.")
         return {str(key): _value(own, get_args(bare)[1], joined(name, str(key))) for key, own in value.items()}
     choices = [part for part in _parts(bare) if isinstance(part, str)]
-    if choices and (not isinstance(value, str) or value not in choices):
+    listed = isinstance(value, list | tuple) and tuple in {get_origin(part) for part in _parts(bare)}
+    if choices and not listed and (not isinstance(value, str) or value not in choices):
         raise SceneError(f"{name} = {shown(value)}: {suggest(value, choices)}.")
     try:
         made = msgspec.convert(value, bare)

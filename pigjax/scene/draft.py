@@ -20,14 +20,17 @@ from jaxtyping import Bool, Float, Int
 from pigjax import io
 from pigjax.core.camera import Camera, orbit
 from pigjax.core.errors import InputError
+from pigjax.core.placing import placed, up_to
+from pigjax.core.upright import find_up
 from pigjax.coupling.solid import large_parts, parts_of
 from pigjax.mpm.materials import PRESETS
 from pigjax.objects.lifting import lift
+from pigjax.scene.world import AXES, axis_of, placed_cameras
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, RenderConfig, render
 from pigjax.splatting.types import extent_of
 
-AXES = ("x", "y", "z", "-x", "-y", "-z")
+_Z = np.array([0.0, 0.0, 1.0])
 THUMBNAIL = 192  # px
 _BINS = 60  # of the heights in which a ground is looked for
 _LEAST_GROUND = 0.12  # share of the splats in a layer that counts as a ground
@@ -64,7 +67,10 @@ class Draft:
     text: str  # of scene.toml
     parts: list[Part]
     labels: Labels | None  # for labels.npz; None: masks or a single object tell
-    up: str
+    mark: str  # digest of the file's Gaussians, for the labels
+    gaussians: Gaussians  # in the scene's world, with z up
+    cameras: Camera | None  # of the photos, in that world
+    up: str  # of the files: the name of an axis, or three numbers
     remarks: list[str] = field(default_factory=list)  # guesses and gaps, each with its remedy
 
 
@@ -76,7 +82,7 @@ def draft_scene(
     masks_path: Path | None = None,
     names_path: Path | None = None,
     up: str | None = None,
-) -> tuple[Draft, Gaussians, io.Views | None]:
+) -> Draft:
     """Draft a scene for Gaussians, with posed photos and masks where there are any.
 
     Args:
@@ -85,67 +91,89 @@ def draft_scene(
         views_path: posed photos.
         masks_path: instance masks of the photos.
         names_path: JSON of mask ids and names.
-        up: axis that points up (x, y, z, -x, -y, -z); None: from the cameras, else from the ground.
-
-    Returns:
-        The draft, and the Gaussians and views that it was made from.
+        up: direction of the files that points up: x, y, z, -x, -y, -z, or three numbers; None: from the cameras, else
+            from the ground.
 
     Raises:
-        InputError: a file is damaged, the axis is unknown, or no part of the scene is large enough for an object.
+        InputError: a file is damaged, the direction is none, or no part of the scene is large enough for an object.
     """
-    if up is not None and up not in AXES:
-        raise InputError(f"up = {up!r}: choose one of {', '.join(AXES)}.")
+    given = None if up is None else axis_of(_direction(up))
     gaussians = io.load_gaussians(gaussians_path, drop_invalid=True)
     names = {} if names_path is None else io.load_names(names_path)
     views = None
     if views_path is not None:
-        masks = {} if masks_path is None else {"masks": masks_path, "missing_masks": "abstain"}
-        views = io.load_views(views_path, **masks)
-    core = extent_of(gaussians).core
-    means = np.asarray(gaussians.means, np.float64)
+        views = io.load_views(views_path, masks=masks_path, missing_masks="abstain")
+    extent = extent_of(gaussians)
     remarks: list[str] = []
-    if up is None:
-        up, told = up_of_cameras(views.cameras) if views is not None else up_of_ground(means[core])
+    if given is None:
+        cameras = None if views is None else views.cameras
+        given, told = find_direction(cameras, np.asarray(gaussians.means, np.float64)[extent.core])
         remarks.append(told)
-    axis = _axis(up)
-    ground = ground_height(means[core], axis)
+    given = axis_of(_direction(_name_of(given)))  # as the file will say it
+    world = up_to(given, _Z)
+    here = placed(gaussians, world)
+    labels = ground = None
     if views is not None and views.masks is not None:
-        parts, labels, ground = _masked_parts(gaussians, views, names), None, None
-        height = min(_lowest(part, axis) for part in parts)
+        parts = _masked_parts(gaussians, here, views, names)
     else:
-        parts, labels = _connected_parts(gaussians, core, axis, ground)
-        height = min(_lowest(part, axis) for part in parts) if ground is None else ground
+        ground = ground_height(np.asarray(here.means, np.float64)[extent.core], _Z)
+        parts, labels = _connected_parts(here, extent.core, ground)
         remarks.append(
             "no masks: objects are the connected parts above the ground; for other ones give"
             " objects.<name>.within = { lower = [x, y, z], upper = [x, y, z] }, or masks of posed photos."
         )
-    _mark_supports(parts, axis)
-    text = _text(
-        _Sources(gaussians_path, views_path, masks_path, names_path, folder),
-        parts, labels is not None, up, height, ground is not None, extent_of(gaussians).radius, remarks,
-    )  # fmt: skip
-    return Draft(text, parts, labels, up, remarks), gaussians, views
+    _mark_supports(parts)
+    height = min(float(part.low[2]) for part in parts) if ground is None else ground
+    middle = np.dot(world[:3, :3], extent.centre) * [1, 1, 0] + [0, 0, height]
+    origin = np.dot(world[:3, :3].T, middle)
+    world[:3, 3] = -middle
+    for part in parts:
+        part.low, part.high = part.low - middle, part.high - middle
+    sources = _Sources(gaussians_path, views_path, masks_path, names_path, folder)
+    text = _text(sources, parts, labels is not None, given, origin, ground is not None, extent.radius, remarks)
+    return Draft(
+        text=text,
+        parts=parts,
+        labels=labels,
+        mark=io.digest_of_scene(gaussians),
+        gaussians=placed(gaussians, world),
+        cameras=None if views is None else placed_cameras(views.cameras, world),
+        up=_name_of(given),
+        remarks=remarks,
+    )
 
 
-def up_of_cameras(cameras: Camera) -> tuple[str, str]:
-    """The axis nearest to the mean of what cameras have above them, and a sentence that tells it."""
-    above = -np.asarray(cameras.world_to_cam, np.float64)[..., 1, :3].reshape(-1, 3).mean(0)
-    length = float(np.linalg.norm(above))
-    k = int(np.argmax(np.abs(above)))
-    name = ("" if above[k] > 0 else "-") + "xyz"[k]
-    angle = np.degrees(np.arccos(np.clip(np.abs(above[k]) / max(length, 1e-12), 0, 1)))
-    told = f"up = {name}: the cameras' own up, on average, is {angle:.0f} degrees from it"
-    far = "; the scene is tilted, check it" if angle > 20 or length < 0.3 else ""
-    return name, f"{told}{far}."
+def find_direction(cameras: Camera | None, means: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], str]:
+    """The direction that points up in a scene's files, and a sentence that tells how it was found.
+
+    Without cameras an axis with a ground at its lower end comes first, then any plane; else it is z.
+
+    Args:
+        cameras: of the photos, if there are any.
+        means: centres of the dense core.
+    """
+    if cameras is None:
+        name, told, is_sure = up_of_ground(means)
+        if is_sure:
+            return axis_of(name), told
+    try:
+        found = find_up(cameras, means)
+    except InputError:
+        return _Z, "up = z: a guess, since neither cameras nor a ground tell it; give --up if it is another axis."
+    roll = "" if found.roll is None else f", which roll by {found.roll:.1f} degrees"
+    return found.up, f"up = {_name_of(found.up)}: from the {found.by}{roll}."
 
 
-def up_of_ground(means: Float[np.ndarray, "n 3"]) -> tuple[str, str]:
-    """The axis along which the lower end of a cloud is most like a ground, and a sentence that tells it."""
-    shares = {name: _ground_layer(means @ _axis(name))[0] for name in AXES}
+def up_of_ground(means: Float[np.ndarray, "n 3"]) -> tuple[str, str, bool]:
+    """The axis whose lower end is most like a ground, a sentence that tells it, and whether it stands out.
+
+    Args:
+        means: centres of the dense core.
+    """
+    shares = {name: _ground_layer(means @ axis_of(name))[0] for name in AXES}
     best, second = sorted(shares, key=lambda name: shares[name], reverse=True)[:2]
-    if shares[best] < _LEAST_GROUND or shares[best] < 1.3 * shares[second]:
-        return "z", "up = z: a guess, since no ground is seen in the splats; give --up if it is another axis."
-    return best, f"up = {best}: {100 * shares[best]:.0f} % of the splats lie in one layer at that axis' lower end."
+    is_sure = shares[best] >= _LEAST_GROUND and shares[best] >= 1.3 * shares[second]
+    return best, f"up = {best}: {100 * shares[best]:.0f} % of the splats lie in one layer at its lower end.", is_sure
 
 
 def ground_height(means: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, "3"]) -> float | None:
@@ -164,14 +192,12 @@ def ground_height(means: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, "3"])
     return height if areas[0] > _WIDER * areas[1] else None
 
 
-def thumbnails(
-    gaussians: Gaussians, parts: list[Part], views: io.Views | None, up: str
-) -> dict[str, Float[np.ndarray, "h w 3"]]:
-    """A picture of each object alone: from the view that shows it largest, else from an orbit around it.
+def thumbnails(draft: Draft) -> dict[str, Float[np.ndarray, "h w 3"]]:
+    """A picture of each object alone, from the side of the nearest camera, else from an orbit around it.
 
     One program draws all: the other Gaussians are there, and transparent.
     """
-    hidden = jnp.full_like(gaussians.logit_opacities, -40.0)
+    hidden = jnp.full_like(draft.gaussians.logit_opacities, -40.0)
     config = RenderConfig(bands=1)
 
     @jax.jit
@@ -181,23 +207,29 @@ def thumbnails(
         return jnp.clip(frame.rgb, 0, 1)
 
     pictures = {}
-    for part in parts:
-        opacities = jnp.where(jnp.asarray(part.members), gaussians.logit_opacities, hidden)
-        pictures[part.name] = np.asarray(draw(gaussians, opacities, _camera_of(part, views, up)))
+    for part in draft.parts:
+        opacities = jnp.where(jnp.asarray(part.members), draft.gaussians.logit_opacities, hidden)
+        pictures[part.name] = np.asarray(draw(draft.gaussians, opacities, _camera_of(part, draft.cameras)))
     return pictures
 
 
-def _axis(up: str) -> Float[np.ndarray, "3"]:
-    return np.eye(3)["xyz".index(up[-1])] * (-1 if up.startswith("-") else 1)
+def _direction(up: str) -> str | tuple[float, float, float]:
+    """The name of an axis, or the three numbers of a text."""
+    try:
+        numbers = [float(word) for word in up.replace(",", " ").split()]
+    except ValueError:
+        return up
+    if len(numbers) != 3:
+        raise InputError(f"up = {up!r}: choose one of {', '.join(AXES)}, or give three numbers.")
+    return numbers[0], numbers[1], numbers[2]
 
 
-def _lowest(part: Part, axis: Float[np.ndarray, "3"]) -> float:
-    """Height of its foot [m]."""
-    return float(min(part.low @ axis, part.high @ axis))
-
-
-def _highest(part: Part, axis: Float[np.ndarray, "3"]) -> float:
-    return float(max(part.low @ axis, part.high @ axis))
+def _name_of(direction: Float[np.ndarray, "3"]) -> str:
+    """The name of the axis that a direction is within half a degree of; else its three numbers."""
+    for name in AXES:
+        if float(direction @ axis_of(name)) > np.cos(np.radians(0.5)):
+            return name
+    return ", ".join(f"{value:.5f}" for value in direction)
 
 
 def _ground_layer(heights: Float[np.ndarray, "n"]) -> tuple[float, float, float]:
@@ -214,12 +246,13 @@ def _ground_layer(heights: Float[np.ndarray, "n"]) -> tuple[float, float, float]
     return share, float(np.median(inside)), float(edges[k + 2])
 
 
-def _masked_parts(gaussians: Gaussians, views: io.Views, names: dict[int, str]) -> list[Part]:
-    voters = views.training
+def _masked_parts(gaussians: Gaussians, here: Gaussians, views: io.Views, names: dict[int, str]) -> list[Part]:
+    """Objects of the masks: lifted where the files have them, measured in the world."""
+    voters = views.voters
     assert voters.masks is not None
-    labels = lift(gaussians, voters.cameras, voters.masks)
+    labels = lift(gaussians, voters.cameras, voters.masks, valid=voters.valid)
     object_id = np.asarray(labels.object_id)
-    means = np.asarray(gaussians.means, np.float64)
+    means = np.asarray(here.means, np.float64)
     found = [int(number) for number in np.unique(object_id) if number > 0]
     parts = [_part(_free(names, k), k, object_id == k, means) for k in found]
     for part in parts:
@@ -230,11 +263,11 @@ def _masked_parts(gaussians: Gaussians, views: io.Views, names: dict[int, str]) 
 
 
 def _connected_parts(
-    gaussians: Gaussians, core: Bool[np.ndarray, "n"], axis: Float[np.ndarray, "3"], ground: float | None
+    gaussians: Gaussians, core: Bool[np.ndarray, "n"], ground: float | None
 ) -> tuple[list[Part], Labels | None]:
     """Parts above the ground, the largest first, and the labels that say so; a single one without a ground has none."""
     means = np.asarray(gaussians.means, np.float64)
-    heights = np.where(core, means @ axis, -np.inf)
+    heights = np.where(core, means[:, 2], -np.inf)
     free = core.copy()
     if ground is not None:
         layer = np.abs(heights[core] - ground)
@@ -272,40 +305,34 @@ def _free(names: dict[int, str], number: int) -> str:
     return name if fit else f"object_{number}"
 
 
-def _mark_supports(parts: list[Part], axis: Float[np.ndarray, "3"]) -> None:
+def _mark_supports(parts: list[Part]) -> None:
     """What carries the others is fixed: by its name, or since the feet of most others stand over its top."""
-    across = np.abs(axis) < 0.5
     for part in parts:
         others = [other for other in parts if other is not part]
         over = 0
         for other in others:
-            middle = ((other.low + other.high) / 2)[across]
-            inside = bool(((middle >= part.low[across]) & (middle <= part.high[across])).all())
-            foot, tall = _lowest(other, axis), _highest(other, axis) - _lowest(other, axis)
-            over += inside and abs(foot - _highest(part, axis)) < max(0.5 * tall, 1e-9) and foot > _lowest(part, axis)
+            middle = (other.low + other.high)[:2] / 2
+            inside = bool(((middle >= part.low[:2]) & (middle <= part.high[:2])).all())
+            foot, tall = float(other.low[2]), float(other.high[2] - other.low[2])
+            over += inside and abs(foot - part.high[2]) < max(0.5 * tall, 1e-9) and foot > part.low[2]
         named = re.sub(r"[\W_0-9]+", " ", part.name.lower()).split()
         carries = len(others) > 1 and 2 * over >= len(others)
         part.fixed = carries or (bool(others) and any(word in _SUPPORTS for word in named))
     if all(part.fixed for part in parts):
-        max(parts, key=lambda part: _highest(part, axis)).fixed = False
+        max(parts, key=lambda part: float(part.high[2])).fixed = False
 
 
-def _camera_of(part: Part, views: io.Views | None, up: str) -> Camera:
+def _camera_of(part: Part, cameras: Camera | None) -> Camera:
     """A square camera that the object fills."""
     middle, radius = (part.low + part.high) / 2, max(float(np.linalg.norm(part.high - part.low)) / 2, 1e-6)
-    axis, distance = _axis(up), 2.6 * radius
-    start, elevation = 0.0, np.radians(25)
-    if views is not None:
-        places = np.asarray(views.cameras.position, np.float64).reshape(-1, 3)
-        offset = places[int(np.argmin(np.linalg.norm(places - middle, axis=1)))] - middle
-        along = float(np.clip(offset @ axis / max(np.linalg.norm(offset), 1e-12), -0.95, 0.95))
-        elevation = float(np.arcsin(along))
-        first = np.eye(3)[0] if abs(axis[0]) < 0.9 else np.eye(3)[2]
-        first = first - axis * (first @ axis)
-        start = float(np.arctan2(offset @ np.cross(axis, first), offset @ first))
+    start, elevation = 0.0, float(np.radians(25))
+    if cameras is not None:
+        places = np.asarray(cameras.position, np.float64).reshape(-1, 3)
+        x, y, z = places[int(np.argmin(np.linalg.norm(places - middle, axis=1)))] - middle
+        start, elevation = float(np.arctan2(y, x)), float(np.clip(np.arctan2(z, np.hypot(x, y)), -1.25, 1.25))
     return orbit(
-        middle, radius=distance, elevation=elevation, frames=1, focal=1.15 * THUMBNAIL,
-        width=THUMBNAIL, height=THUMBNAIL, start=start, up=axis,
+        middle, radius=2.6 * radius, elevation=elevation, frames=1, focal=1.15 * THUMBNAIL,
+        width=THUMBNAIL, height=THUMBNAIL, start=start,
     )[0]  # fmt: skip
 
 
@@ -336,34 +363,36 @@ def _text(
     sources: _Sources,
     parts: list[Part],
     labelled: bool,
-    up: str,
-    height: float,
+    up: Float[np.ndarray, "3"],
+    origin: Float[np.ndarray, "3"],
     is_ground: bool,
     radius: float,
     remarks: list[str],
 ) -> str:
-    axis = _axis(up)
     moving = [part for part in parts if not part.fixed]
     dx = _rounded(min(part.size for part in moving) / _CELLS)
-    tall = max(_highest(part, axis) - _lowest(part, axis) for part in moving)
-    point = ", ".join(f"{value + 0.0:.4g}" for value in axis * height)
-    normal = ", ".join(f"{value + 0.0:g}" for value in axis)
-    tallest = max(moving, key=lambda part: _highest(part, axis) - _lowest(part, axis))
-    held = _lowest(tallest, axis) + 0.15 * tall
-    foot = ", ".join(f"{value + 0.0:.4g}" for value in axis * held)
+    tallest = max(moving, key=lambda part: part.high[2] - part.low[2])
+    tall = float(tallest.high[2] - tallest.low[2])
+    held = float(tallest.low[2]) + 0.15 * tall
+    name = _name_of(up)
+    direction = _quoted(name) if name in AXES else f"[{name}]"
+    middle = ", ".join(f"{value + 0.0:.6g}" for value in origin)
     lines = [
         "# Written by `pigjax new` to be edited; lines behind # are choices. Run it: pigjax run scene.toml -o out",
         *(f"# {remark}" for remark in remarks),
         "",
         "[input]",
         *sources.lines(labelled),
-        f"up = {_quoted(up)} # axis of the scene that points up: x, y, z, -x, -y or -z",
         "",
-        "# Lengths are in the units of the splats, read as metres. Cameras of COLMAP have no scale: the tallest moving",
-        f"# object is {tall:.3g} units tall here. If that is not its height in metres, it weighs too much or too",
-        "# little for its stiffness: multiply young (and yield_stress, cohesion) by units per metre.",
+        "# This file is in metres, z up, and 0 on the ground. Cameras of COLMAP have no scale: give the true height of",
+        f'# one object, as height = "30 cm" in objects.{_key(tallest.name)} ({tall:.3g} units tall here); lengths',
+        "# below are then to be scaled likewise.",
+        "[world]",
+        f"up = {direction} # direction of the files that points up: x, y, z, -x, -y, -z, or three numbers",
+        f"origin = [{middle}] # point of the files that is 0 here",
+        "",
         "[simulation]",
-        f"dx = {dx:g} # grid spacing [m]: a sixteenth of the smallest moving object; smaller is finer and slower",
+        f"# dx = {dx:g} # grid spacing [m]; left out, a sixteenth of the smallest moving object; smaller is slower",
         "frames = 48",
         "fps = 24 # frames a second of the video",
         "gravity = 9.81 # m/s², against up",
@@ -376,13 +405,13 @@ def _text(
         lines += _object_lines(part, needs_id=labelled or (sources.views is not None and not part.is_known))
     lines += [
         f"[planes.ground] # {'the layer of splats at the lower end' if is_ground else 'below all objects'}",
-        f"point = [{point}] # m",
-        f"normal = [{normal}]",
+        "point = [0, 0, 0] # m",
+        "normal = [0, 0, 1]",
         "friction = 0.5 # Coulomb's coefficient",
         "",
         "# [pinned.foot] # matter behind this plane does not move, as a plant in its pot",
-        f"# point = [{foot}] # m",
-        f"# normal = [{normal}]",
+        f"# point = [0, 0, {held:.4g}] # m",
+        "# normal = [0, 0, 1]",
         "",
         "# [forces.breeze] # beside gravity: kind = wind, field, impulse or spring",
         '# kind = "wind"',

@@ -14,13 +14,15 @@ from pigjax.mpm import Health, Particles
 Record: TypeAlias = dict[str, np.ndarray]  # numbers of one frame, by name
 MARK = "health_"  # prefix of a record's names in a state file
 _GAIN = 0.05  # energy that appears from nowhere, relative to the largest kinetic energy, beyond what steps round off
+_MATTER, _WORDS = ("volume_ratio", "stretch"), ("least", "mean", "most")
 _MOST = ("escaped", "inverted", "wall_hits")  # counts that may fall again: the most at one time
 
 
 def health_record(particles: Particles, health: Health | None, gravity: Float[np.ndarray, "3"]) -> Record:
-    """Health of a frame, None at the start, and the energy and momentum after it.
+    """Health of a frame, None at the start, and the energy, momentum and deformation after it.
 
-    Energies are the kinetic one and that of gravity from the world's origin; elastic energy is not among them.
+    Energies are the kinetic one and that of gravity from the world's origin; elastic energy is not among them. Stretch
+    is the root mean square over directions, √(‖F‖² / 3), of the total deformation F, and the volume's ratio is det F.
     """
     numbers = () if health is None else fields(Health)
     record = {field.name: np.asarray(getattr(health, field.name)) for field in numbers if field.name != "sides_met"}
@@ -32,7 +34,21 @@ def health_record(particles: Particles, health: Health | None, gravity: Float[np
         "kinetic_energy": np.asarray((mass * (v**2).sum(1)).sum() / 2),
         "gravity_energy": np.asarray((mass * height).sum()),
         "momentum": (mass[:, None] * v).sum(0),
+        **_deformation(np.asarray(particles.F_visual)),
     }
+
+
+def _deformation(F: Float[np.ndarray, "p 3 3"]) -> Record:
+    """Least, mean and largest volume ratio and stretch of the particles that are finite."""
+    a, b, c = np.moveaxis(F, -1, 0)
+    volume = np.einsum("pi,pi->p", a, np.cross(b, c))
+    stretch = np.sqrt(np.einsum("pij,pij->p", F, F) / 3)
+    record: Record = {}
+    for name, values in (("volume_ratio", volume), ("stretch", stretch)):
+        known = values[np.isfinite(values)].astype(np.float64)
+        numbers = (known.min(), known.mean(), known.max()) if len(known) else (np.nan,) * 3
+        record |= {f"{name}_{word}": np.asarray(number) for word, number in zip(_WORDS, numbers)}
+    return record
 
 
 def summary(records: Mapping[int, Record]) -> dict[str, Any]:
@@ -54,7 +70,13 @@ def summary(records: Mapping[int, Record]) -> dict[str, Any]:
         "kinetic_energy_J": energy["kinetic"],
         "gravity_energy_J": energy["gravity"],
         "momentum_kg_m_s": [row["momentum"].tolist() for row in everything],
+        **{name: {word: _series(everything, f"{name}_{word}") for word in _WORDS} for name in _MATTER},
     }
+
+
+def _series(rows: list[Record], name: str) -> list[float]:
+    """A number of each frame; NaN where a state does not have it."""
+    return [float(row.get(name, np.nan)) for row in rows]
 
 
 def remarks(health: Mapping[str, Any], *, driven: bool) -> list[str]:

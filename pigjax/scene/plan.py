@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from pigjax import io
 from pigjax.clamp import ClampParams
 from pigjax.core.camera import Camera, orbit, stack_cameras
-from pigjax.core.checks import suggest
-from pigjax.core.errors import InputError, SceneError
+from pigjax.core.checks import joined, suggest
+from pigjax.core.errors import SceneError
+from pigjax.core.placing import placed
+from pigjax.core.regions import Region
 from pigjax.coupling.binding import Binding, bind
+from pigjax.coupling.outliers import cut_outliers, told
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
 from pigjax.mls_mpm import SimConfig
@@ -28,11 +33,16 @@ from pigjax.mpm.forces import Force
 from pigjax.mpm.materials import Material, MaterialTable
 from pigjax.mpm.sleep import Sleep
 from pigjax.objects.lifting import lift
+from pigjax.scene.advice import default_dx, remarks_on
 from pigjax.scene.forces import forces_of
-from pigjax.scene.schema import CameraSpec, Scene, SimulationSpec
-from pigjax.segmentation import Labels
+from pigjax.scene.framing import framing_camera
+from pigjax.scene.schema import INPUT_FILES, CameraSpec, ClampSpec, Scene, SimulationSpec
+from pigjax.scene.world import WorldSpec, axis_of, file_to_world, height_of, metres_of, placed_cameras
+from pigjax.segmentation import Labels, fill_unseen
 from pigjax.splat import Gaussians, RenderConfig
 from pigjax.splatting.types import extent_of
+
+_FRAMED = 0.98  # share of the moving matter that the default orbit frames
 
 
 @dataclass
@@ -43,6 +53,16 @@ class Inputs:
     views: io.Views | None
     ids: dict[str, int]  # id of each object of the scene
     names: dict[int, str]  # names that `input.names` gives to ids
+    stored: io.StoredLabels | None = None  # of `input.labels`
+    own: dict[str, Gaussians] = field(default_factory=dict)  # of the objects that have a file of their own
+    world: Float[np.ndarray, "4 4"] | None = None  # transform from the files; None: none
+    labels: Labels | None = None  # where the scale of the world needed them
+    arranged: bool = False  # whether objects were placed, copied or removed
+
+    @property
+    def moved(self) -> bool:
+        """Whether the Gaussians are not as their file has them."""
+        return self.arranged or self.world is not None
 
 
 @dataclass
@@ -60,38 +80,78 @@ class Plan:
     config: SimConfig
     clamp: ClampParams
     frame_dt: float  # [s]
+    dx: float  # grid spacing [m]
+    pins: tuple[Region, ...]
+    starts: tuple[int, ...]  # frame with which each row of the table begins to move
+    remarks: list[str]  # on the scene as a whole, each with its remedy
     labels: Labels  # Gaussians buried in still objects belong to these
 
 
 def read_inputs(scene: Scene) -> Inputs:
-    """Read Gaussians, views and names.
+    """Read Gaussians, views, labels and names.
 
     Raises:
-        InputError: a file is missing or damaged.
+        InputError: a file is missing or damaged, or labels other Gaussians.
         SceneError: an object has no id of its own, or `camera.view` is not the name of a photo.
     """
     spec = scene.input
     names = {} if spec.names is None else io.load_names(scene.path(spec.names))
-    ids = {name: _id_of(name, scene, names) for name in scene.objects}
-    _check_ids(ids)
-    gaussians = io.load_gaussians(scene.path(spec.gaussians), drop_invalid=spec.drop_invalid, origin=spec.origin)
+    known = {name: _id_of(name, scene, names) for name in scene.objects}
+    _check_ids({name: number for name, number in known.items() if number is not None})
+    gaussians = read_gaussians(scene)
     views = None
     if spec.views is not None:
         masks = True if spec.masks is None else scene.path(spec.masks)
+        photos = None if spec.images is None else scene.path(spec.images)
         views = io.load_views(
-            scene.path(spec.views), masks=masks, missing_masks="abstain", max_size=spec.max_size, origin=spec.origin
-        )
+            scene.path(spec.views), images=photos, masks=masks, missing_masks="abstain", max_size=spec.max_size,
+            origin=spec.origin,
+        )  # fmt: skip
     if scene.camera.view is not None:
         _camera_of_view(scene.camera, views)
-    return Inputs(gaussians, views, ids, names)
+    stored = None
+    if spec.labels is not None:
+        mark = None if spec.origin is not None else io.digest_of_scene(gaussians)
+        stored = io.load_labels(scene.path(spec.labels), len(gaussians), scene=mark)
+    own = {
+        name: io.load_gaussians(scene.path(entry.gaussians), drop_invalid=spec.drop_invalid)
+        for name, entry in scene.objects.items()
+        if entry.gaussians is not None
+    }
+    return _placed_inputs(scene, Inputs(gaussians, views, _numbered(known, names, views, stored), names, stored, own))
 
 
-def _id_of(name: str, scene: Scene, names: dict[int, str]) -> int:
-    own = scene.objects[name].id
-    if own is not None:
-        return own
+def _numbered(
+    known: dict[str, int | None], names: dict[int, str], views: io.Views | None, stored: io.StoredLabels | None
+) -> dict[str, int]:
+    """Ids of all objects; those that nothing numbers get new ones."""
+    taken = [0, *names, *(number for number in known.values() if number is not None)]
+    if views is not None and views.masks is not None:
+        taken.append(int(np.max(views.masks)))
+    if stored is not None:
+        taken.append(int(stored.object_id.max(initial=0)))
+    free = itertools.count(max(taken) + 1)
+    return {name: next(free) if number is None else number for name, number in known.items()}
+
+
+def read_gaussians(scene: Scene) -> Gaussians:
+    """Gaussians of the scene at rest, in the frame in which they are simulated.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    spec = scene.input
+    return io.load_gaussians(scene.path(spec.gaussians), drop_invalid=spec.drop_invalid, origin=spec.origin)
+
+
+def _id_of(name: str, scene: Scene, names: dict[int, str]) -> int | None:
+    """The id that the scene or its names give to an object; None for one that neither masks nor labels show."""
+    entry = scene.objects[name]
+    if entry.id is not None or entry.gaussians is not None:
+        return entry.id
     found = io.id_named(name, names)
-    if found is None:
+    chosen = entry.within is not None or (scene.input.views is None and scene.input.labels is None)
+    if found is None and not chosen:
         remedy = suggest(name, list(names.values())) if names else f"give objects.{name}.id, or input.names"
         raise SceneError(f"objects.{name}: no object of that name in {scene.input.names or 'input.names'}; {remedy}.")
     return found
@@ -106,21 +166,66 @@ def _check_ids(ids: dict[str, int]) -> None:
 
 
 def segment(scene: Scene, inputs: Inputs) -> Labels:
-    """Objects of the Gaussians, by the masks; without masks all belong to the only object.
+    """Objects of the Gaussians: by `input.labels` or by the masks, without both all belong to the only object.
+
+    Regions of objects (`within`) overrule both.
 
     Raises:
         SceneError: no Gaussian belongs to an object.
     """
+    if inputs.labels is not None:
+        return inputs.labels
+    regions = {
+        name: entry.within.to_region(joined("objects", name, "within"))
+        for name, entry in scene.objects.items()
+        if entry.within is not None
+    }
+    asked = {name: k for name, k in inputs.ids.items() if name not in regions and name not in inputs.own}
+    if inputs.stored is not None:
+        labels = _stored(scene, inputs, asked)
+    elif inputs.views is not None:
+        labels = _lifted(scene, inputs, asked)
+    else:
+        labels = _one_object(inputs, next(iter(asked.values()), 0))
+    for name, region in regions.items():
+        mine = np.asarray(region.contains(inputs.gaussians.means))
+        if not mine.any():
+            raise SceneError(f"{joined('objects', name, 'within')}: no Gaussian has its centre there; move it.")
+        labels = with_id(labels, mine, inputs.ids[name])
+    for name, number in inputs.ids.items():
+        if name not in inputs.own and not np.any(np.asarray(labels.object_id) == number):
+            raise SceneError(f"objects.{name}: other objects took all its Gaussians; check objects.<name>.within.")
+    if inputs.stored is not None or inputs.views is not None:
+        found = np.unique(np.maximum(labels.object_id, 0))
+        _warn_of_unnamed(inputs, found[found > 0])
+    return labels
+
+
+def _one_object(inputs: Inputs, number: int) -> Labels:
+    total = len(inputs.gaussians)
+    ids = jnp.asarray(sorted({0, number}), jnp.int32)
+    votes = jnp.zeros((total, len(ids)), jnp.int32)
+    return Labels(jnp.full(total, number, jnp.int32), votes, jnp.ones(total), ids=ids)
+
+
+def _stored(scene: Scene, inputs: Inputs, asked: dict[str, int]) -> Labels:
+    stored = inputs.stored
+    assert stored is not None
+    own, votes, confidence = map(jnp.asarray, stored[:3])
+    labels = Labels(own, votes, confidence, ids=None if stored.ids is None else jnp.asarray(stored.ids))
+    for name, number in asked.items():
+        if not np.any(stored.object_id == number):
+            path, there = scene.input.labels, np.unique(stored.object_id[stored.object_id > 0]).tolist()
+            raise SceneError(f"objects.{name}: no Gaussian has its id {number} in {path}, which holds {there}.")
+    return fill_unseen(inputs.gaussians, labels) if scene.segmentation.fill_unseen else labels
+
+
+def _lifted(scene: Scene, inputs: Inputs, asked: dict[str, int]) -> Labels:
     spec = scene.segmentation
-    if inputs.views is None:
-        (only,) = inputs.ids.values()
-        count = len(inputs.gaussians)
-        ids = jnp.asarray(sorted({0, only}), jnp.int32)
-        votes = jnp.zeros((count, len(ids)), jnp.int32)
-        return Labels(jnp.full(count, only, jnp.int32), votes, jnp.ones(count), ids=ids)
+    assert inputs.views is not None
     views = inputs.views.voters
     assert views.masks is not None
-    check_ids_occur(inputs.ids, views.masks)
+    check_ids_occur(asked, views.masks)
     labels = lift(
         inputs.gaussians,
         views.cameras,
@@ -129,12 +234,12 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
         tau_T=spec.tau_T,
         tau_d=spec.tau_d,
         background=spec.background,
+        valid=views.valid,
     )
     found = np.unique(np.maximum(labels.object_id, 0))
-    for name, number in inputs.ids.items():
+    for name, number in asked.items():
         if number not in found:
             raise SceneError(f"objects.{name}: no Gaussian has its id {number} in the masks; check input.masks.")
-    _warn_of_unnamed(inputs, found[found > 0])
     return labels
 
 
@@ -170,8 +275,11 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         SceneError: something of the scene cannot be simulated, named by its field.
     """
     spec = scene.simulation
-    solids = _still_solids(scene, inputs, labels)
-    labels = _without_buried(inputs, labels, solids, spec.dx)
+    keep = {inputs.ids[name]: entry.keep for name, entry in scene.objects.items()}
+    labels, cut = cut_outliers(inputs.gaussians, labels, keep)
+    dx = spec.dx or default_dx(scene, inputs.gaussians, labels, inputs.ids)
+    solids = _still_solids(scene, inputs, labels, dx)
+    labels = _without_buried(inputs, labels, solids, dx)
     moving = {name: entry for name, entry in scene.objects.items() if not entry.fixed}
     materials: dict[int, Material] = {inputs.ids[name]: entry.to_material(name) for name, entry in moving.items()}
     colliders = (*solids.values(), *scene.colliders())
@@ -180,8 +288,9 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         labels,
         materials,
         fill=spec.fill,
-        spacing=spec.dx,
+        spacing=dx,
         velocities={inputs.ids[name]: entry.velocity for name, entry in moving.items()},
+        spins={inputs.ids[name]: e.angular_velocity for name, e in moving.items() if any(e.angular_velocity)},
         particles_per_cell=spec.particles_per_cell,
         colliders=colliders,
         seed=spec.seed,
@@ -189,6 +298,8 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
     binding = bind(inputs.gaussians, labels, particles)
     gravity = spec.gravity
     vector = np.array(gravity) if isinstance(gravity, tuple) else -gravity * axis_of(scene.input.up)
+    frame_dt = 1 / (spec.fps * spec.slow_motion)
+    lost = told(cut, {number: name for name, number in inputs.ids.items()})
     return Plan(
         particles=particles,
         table=table,
@@ -199,15 +310,24 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels) -> Plan:
         sleep=None if spec.sleep is None else Sleep(speed=spec.sleep),
         gravity=vector,
         config=SimConfig(kernel=spec.kernel, cfl=spec.cfl, integrator=spec.integrator),
-        clamp=ClampParams(
-            tau_min=jnp.asarray(scene.clamp.tau_min),
-            tau_max=jnp.asarray(scene.clamp.tau_max),
-            lambda_R=jnp.asarray(scene.clamp.lambda_R),
-            lambda_S=jnp.asarray(scene.clamp.lambda_S),
-            relative=scene.clamp.relative,
-        ),
-        frame_dt=1 / (spec.fps * spec.slow_motion),
+        clamp=clamp_params(scene.clamp),
+        frame_dt=frame_dt,
+        dx=dx,
+        pins=scene.pins(),
+        starts=tuple(math.ceil(entry.start / frame_dt - 1e-9) for entry in moving.values()),
+        remarks=[*lost, *remarks_on(scene, particles, table, vector, dx)],
         labels=labels,
+    )
+
+
+def clamp_params(spec: ClampSpec) -> ClampParams:
+    """Bounds and weights of a scene's eigen-clamp."""
+    return ClampParams(
+        tau_min=jnp.asarray(spec.tau_min),
+        tau_max=jnp.asarray(spec.tau_max),
+        lambda_R=jnp.asarray(spec.lambda_R),
+        lambda_S=jnp.asarray(spec.lambda_S),
+        relative=spec.relative,
     )
 
 
@@ -217,8 +337,9 @@ def _contact(spec: SimulationSpec, bodies: int) -> BodyContact | None:
     return BodyContact(bodies=bodies, friction=jnp.asarray(spec.contact_friction))
 
 
-def _still_solids(scene: Scene, inputs: Inputs, labels: Labels) -> dict[str, Collider]:
+def _still_solids(scene: Scene, inputs: Inputs, labels: Labels, dx: float) -> dict[str, Collider]:
     object_id = np.asarray(labels.object_id)
+    eyes = None if inputs.views is None else np.asarray(inputs.views.training.cameras.position, np.float64)
     solids: dict[str, Collider] = {}
     for name, entry in scene.objects.items():
         if entry.fixed:
@@ -226,13 +347,31 @@ def _still_solids(scene: Scene, inputs: Inputs, labels: Labels) -> dict[str, Col
             own = jax.tree.map(lambda values, members=members: values[members], inputs.gaussians)
             solids[name] = collider_from_gaussians(
                 own,
-                spacing=scene.simulation.dx / 2,
+                spacing=dx / 2,
                 up=axis_of(scene.input.up),
                 others=np.delete(np.asarray(inputs.gaussians.means), members, axis=0),
+                eyes=None if entry.is_placed else eyes,  # elsewhere they did not see it
                 friction=entry.friction,
                 name=f"objects.{name}",
             )
     return solids
+
+
+def with_id(labels: Labels, mine: Bool[np.ndarray, "n"], number: int) -> Labels:
+    """Labels in which some Gaussians have an id, which gets a column of votes where it has none."""
+    columns = np.arange(labels.votes.shape[1]) if labels.ids is None else np.asarray(labels.ids)
+    votes = np.asarray(labels.votes)
+    if number not in columns:
+        order = np.argsort(np.append(columns, number), kind="stable")
+        columns = np.append(columns, number)[order]
+        votes = np.pad(votes, ((0, 0), (0, 1)))[:, order]
+    return replace(
+        labels,
+        object_id=jnp.asarray(np.where(mine, number, np.asarray(labels.object_id)), jnp.int32),
+        votes=jnp.asarray(votes),
+        confidence=jnp.asarray(np.where(mine, 1, np.asarray(labels.confidence))),
+        ids=jnp.asarray(columns, jnp.int32),
+    )
 
 
 def _without_buried(inputs: Inputs, labels: Labels, solids: dict[str, Collider], dx: float) -> Labels:
@@ -247,24 +386,17 @@ def _without_buried(inputs: Inputs, labels: Labels, solids: dict[str, Collider],
     return labels
 
 
-def axis_of(name: str) -> Float[np.ndarray, "3"]:
-    """Unit vector of an axis by its name, "-y".
-
-    Raises:
-        InputError: it has another name.
-    """
-    if name.removeprefix("-") not in ("x", "y", "z"):
-        raise InputError(f"up = {name!r}: choose one of x, y, z, -x, -y, -z.")
-    return np.eye(3)["xyz".index(name[-1])] * (-1 if name.startswith("-") else 1)
-
-
-def make_cameras(scene: Scene, inputs: Inputs, focus: Float[np.ndarray, "3"]) -> Camera:
+def make_cameras(
+    scene: Scene, inputs: Inputs, focus: Float[np.ndarray, "3"], matter: Float[np.ndarray, "p 3"] | None = None
+) -> Camera:
     """Batch of one camera for each frame of the video.
 
     Args:
         scene: its `camera` section.
         inputs: its views, for `camera.view`.
         focus: centre of the orbit where the scene names none [m].
+        matter: positions of the moving objects [m], which a training view frames where there are photos and the scene
+            says nothing of the camera.
 
     Raises:
         SceneError: `camera.view` is not the name of a photo.
@@ -273,9 +405,16 @@ def make_cameras(scene: Scene, inputs: Inputs, focus: Float[np.ndarray, "3"]) ->
     width, height = (max(round(side * scene.drawing.scale), 1) for side in (spec.width, spec.height))
     if spec.view is not None:
         return stack_cameras([_camera_of_view(spec, inputs.views).resized(width, height)] * frames)
+    if inputs.views is not None and matter is not None and spec.is_open:
+        framed = framing_camera(inputs.views, matter, width, height)
+        if framed is not None:
+            return stack_cameras([framed] * frames)
     target = np.array(spec.target) if spec.target is not None else focus
     focal = width / (2 * np.tan(np.radians(spec.field_of_view) / 2))
     radius = spec.radius if spec.radius is not None else _default_radius(inputs.gaussians, target)
+    if spec.radius is None and matter is not None:  # from so far that all of the moving objects fits in
+        fits = np.quantile(np.linalg.norm(matter - target, axis=1), _FRAMED)
+        radius = max(radius, float(fits) / np.sin(np.arctan(min(width, height) / (2 * focal))))
     return orbit(
         target,
         radius=radius,
@@ -325,15 +464,48 @@ def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
         settings.pop(name)
     if scene.output.compress_states:
         settings["output"] = {"compress_states": True}
-    for name in ("gaussians", "views", "masks", "names"):
+    for name in INPUT_FILES:
         settings["input"].pop(name)
     views = inputs.views
     content = {
         "Gaussians": inputs.gaussians,
         "cameras": None if views is None else views.cameras,
         "photos": None if views is None else (views.images, views.names, views.splits),
-        "masks": None if views is None else views.masks,
+        "masks": None if views is None else views.masks if views.valid is None else (views.masks, views.valid),
         "ids of the objects": inputs.ids,
+        "labels": inputs.stored,
+        "Gaussians of objects": inputs.own,
     }
     digests = {name: io.digest(value) for name, value in content.items()}
     return io.parts_of({"": settings, "input files": digests, "precision": str(jnp.result_type(float))})
+
+
+def _placed_inputs(scene: Scene, inputs: Inputs) -> Inputs:
+    """The inputs in metres with z up, as the scene's `[world]` and the heights of its objects say.
+
+    Raises:
+        SceneError: nothing tells which way is up, or an object has no height.
+    """
+    tall = {name: spec.height for name, spec in scene.objects.items() if spec.height is not None}
+    if scene.world == WorldSpec() and not tall:
+        return inputs
+    gaussians, views = inputs.gaussians, inputs.views
+    matrix = file_to_world(scene.world, scene.input.up, gaussians, None if views is None else views.cameras)
+    inputs = _moved(inputs, gaussians, views, matrix)
+    for name, text in tall.items():
+        labels = segment(scene, inputs)
+        mine = np.flatnonzero(np.asarray(labels.object_id) == inputs.ids[name])
+        found = height_of(inputs.gaussians, mine, axis_of(scene.input.up))
+        if not found > 0:
+            raise SceneError(f"objects.{name}.height: its {len(mine)} Gaussians have no height; remove the field.")
+        matrix = np.dot(np.diag([*[metres_of(text, f"objects.{name}.height") / found] * 3, 1.0]), matrix)
+        inputs = _moved(inputs, gaussians, views, matrix)
+        inputs.labels = labels  # votes do not depend on units
+    return inputs
+
+
+def _moved(inputs: Inputs, gaussians: Gaussians, views: io.Views | None, matrix: Float[np.ndarray, "4 4"]) -> Inputs:
+    """The inputs with Gaussians and cameras of the files, moved."""
+    if views is not None:
+        views = replace(views, cameras=placed_cameras(views.cameras, matrix))
+    return replace(inputs, gaussians=placed(gaussians, matrix), views=views, world=matrix)

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import jax.monitoring
+import numpy as np
+from jaxtyping import UInt8
 
 _COMPILE_EVENTS = (
     "/jax/core/compile/jaxpr_trace_duration",
@@ -32,14 +34,16 @@ class StageTime:
 
 @dataclass
 class RunReport:
-    """Result of `run_scene`, written as `report.json`."""
+    """Result of `run_scene`, written as `report.json` and shown by `report.html`."""
 
+    plan: str = ""  # the work in one line: particles, grid, frames, time expected
     modelled: dict[str, Any] = field(default_factory=dict)  # laws, colliders, kernel, ... that the scene traced
     sizes: dict[str, Any] = field(default_factory=dict)  # counts of Gaussians, particles, frames, substeps; mass [kg]
     times: dict[str, StageTime] = field(default_factory=dict)  # by stage
     health: dict[str, Any] = field(default_factory=dict)  # extremes of all frames, energies [J] by frame
     warnings: list[str] = field(default_factory=list)  # each once
     files: dict[str, str] = field(default_factory=dict)  # path of each result, by name
+    sheet: UInt8[np.ndarray, "h w 3"] | None = field(default=None, repr=False)  # contact sheet of the video
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -66,4 +70,5 @@ class RunReport:
             name: {"run_s": round(t.run, 3), "compile_s": round(t.compile, 3), "total_s": round(t.total, 3)}
             for name, t in self.times.items()
         }
-        return {**vars(self), "times": times}
+        told = {name: value for name, value in vars(self).items() if name != "sheet"}
+        return {**told, "times": times}

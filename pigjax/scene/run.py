@@ -18,39 +18,58 @@ from pigjax import io
 from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.errors import SimulationError, StaleError
+from pigjax.core.linalg import safe_norm
 from pigjax.coupling.binding import deform
-from pigjax.mpm import Particles, vast_grid
+from pigjax.mpm import Particles
 from pigjax.mpm.active_grid import ActiveGrid
-from pigjax.mpm.simulate import SimulatedFrame, simulate
+from pigjax.mpm.simulate import SimulatedFrame
 from pigjax.mpm.sleep import Sleeper
-from pigjax.mpm.timestep import substep_rule
 from pigjax.objects.overlay import legend_sheet, overlay
+from pigjax.scene.advice import plan_line
+from pigjax.scene.arrangement import arrange
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
+from pigjax.scene.replay import COLLIDER_FILE, REST_FILE, SCENE_FILE, rows_of, store_colliders, store_rest
 from pigjax.scene.report import RunReport
-from pigjax.scene.schema import Scene
+from pigjax.scene.report_page import report_page
+from pigjax.scene.schema import Scene, values_of
+from pigjax.scene.stages import simulate_stages, stages_of
+from pigjax.scene.world import described
 from pigjax.segmentation import Labels, pixel_ids
 from pigjax.splat import Gaussians, render
 
 _SHEET_FRAMES = 12
-_FILES = ("video.mp4", "contact_sheet.png", "objects.png", "labels.npz", "report.json")
+_FILES = (
+    "video.mp4", "contact_sheet.png", "objects.png", "labels.npz", COLLIDER_FILE, REST_FILE, SCENE_FILE, "report.json",
+    "report.html",
+)  # fmt: skip
 Progress = Callable[[str, int, int], None]  # stage, done, of
+Say = Callable[[str], None]  # a line to read before the long work
 
 
 @checked
 def run_scene(
-    scene: Scene, out_dir: str | os.PathLike[str], *, progress: Progress | None = None, overwrite: bool = False
+    scene: Scene,
+    out_dir: str | os.PathLike[str],
+    *,
+    progress: Progress | None = None,
+    say: Say | None = None,
+    overwrite: bool = False,
 ) -> RunReport:
     """Simulate a scene and draw its video. Host.
 
     Into `out_dir` go `video.mp4`, `contact_sheet.png`, `objects.png` (the objects in their colours), `labels.npz`,
-    `states/<frame>.npz` (x, v and F_visual of every particle) and `report.json`. A run that was killed goes on from its
+    `colliders.npz` (of still objects), `states/<frame>.npz` (x, v and F_visual of every particle),
+    `states/particles.npz` (Gaussian, object, material, mass and rest volume of each), `scene.toml` (every setting, to
+    reproduce), `report.json` and the page `report.html`; `load_run` reads them. A run that was killed goes on from its
     last state; when all states are there, only the video is redrawn.
 
     Args:
         scene: as `load_scene` gives it.
         out_dir: folder for the results, made if it is missing.
         progress: told each stage, frames done and frames to do.
+        say: told the plan (particles, grid, substeps, time expected) and remarks on the scene before it is simulated,
+            a line each; they are in the report, too.
         overwrite: replace states in `out_dir` that were made from something else, instead of refusing them.
 
     Raises:
@@ -64,22 +83,26 @@ def run_scene(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            _run(scene, out, report, tell, overwrite)
+            _run(scene, out, report, tell, say or (lambda line: None), overwrite)
         except StaleError:
             raise  # report.json still tells of the results that are there
-        except BaseException:
-            _leave_report(report, caught, out)
+        except BaseException as error:
+            _leave_report(scene, report, caught, out, error=str(error) or type(error).__name__)
             raise
-        _leave_report(report, caught, out)
+        _leave_report(scene, report, caught, out)
     return report
 
 
-def _leave_report(report: RunReport, caught: list[warnings.WarningMessage], out: Path) -> None:
+def _leave_report(
+    scene: Scene, report: RunReport, caught: list[warnings.WarningMessage], out: Path, *, error: str | None = None
+) -> None:
     report.warnings += list(dict.fromkeys(str(w.message) for w in caught))
     io.write_json(out / "report.json", report.as_dict())
+    settings = io.toml_text(values_of(scene, out))
+    io.write_text(out / "report.html", report_page(scene, report, settings=settings, sheet=report.sheet, error=error))
 
 
-def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: bool) -> None:
+def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, say: Say, overwrite: bool) -> None:
     with report.stage("read"):
         inputs = read_inputs(scene)
         parts = provenance(scene, inputs)
@@ -87,7 +110,8 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: 
         key = io.claim(out / "states", parts, results=results, overwrite=overwrite, signed=io.signed)
     with report.stage("segment"):
         tell("segment", 0, 1)
-        labels = segment(scene, inputs)
+        given = scene
+        scene, inputs, labels = arrange(scene, inputs, segment(scene, inputs))
         tell("segment", 1, 1)
     with report.stage("seed"):
         tell("seed", 0, 1)
@@ -101,9 +125,16 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: 
             labels.ids,
             scene=_mark(scene, inputs),
         )
+        io.save_rows(out / "states", rows_of(plan.particles, labels), signature=key)
+        store_colliders(out / COLLIDER_FILE, scene, plan.colliders)
+        store_rest(out / REST_FILE, inputs, plan.dx)
+        io.write_toml(out / SCENE_FILE, values_of(given, out))
         tell("seed", 1, 1)
     _describe(scene, inputs, plan, labels, report)
-    states = _simulate(scene, plan, out / "states", parts, key, report, tell)
+    for remark in plan.remarks:
+        say(f"note: {remark}")
+    report.warnings += plan.remarks
+    states = _simulate(scene, plan, out / "states", parts, key, report, tell, say)
     if scene.output.states_every == 1:
         with report.stage("simulate"):
             for _ in states:
@@ -113,8 +144,9 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, overwrite: 
 
 
 def _mark(scene: Scene, inputs: Inputs) -> str | None:
-    """Digest of the Gaussians that labels belong to; None where an origin was subtracted from their positions."""
-    return None if scene.input.origin is not None else io.digest_of_scene(inputs.gaussians)
+    """Digest of the Gaussians that labels belong to; None where they are not as in the file."""
+    moved = scene.input.origin is not None or inputs.moved
+    return None if moved else io.digest_of_scene(inputs.gaussians)
 
 
 def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: RunReport) -> None:
@@ -131,8 +163,11 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
         "forces": [type(force).__name__ for force in plan.forces],
         "body_contact": plan.contact is not None,
         "sleep": plan.sleep is not None,
+        "pins": len(plan.pins),
         "sh_coefficients": inputs.gaussians.sh.shape[1],
     }
+    if inputs.world is not None:
+        report.modelled["world"] = described(inputs.world)
     report.sizes |= {
         "gaussians": len(inputs.gaussians),
         "gaussians_of": {names.get(k, f"id {k}"): int(np.sum(object_id == k)) for k in np.unique(object_id)},
@@ -141,6 +176,7 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
         "particles_of_law": of_law,
         "gaussians_without_particle": 0 if plan.binding is None else len(plan.binding),
         "frames": scene.simulation.frames,
+        "dx": plan.dx,
         "mass_kg": float(plan.particles.mass.sum()),
     }
 
@@ -156,7 +192,7 @@ def _particles_of(
 
 
 def _simulate(
-    scene: Scene, plan: Plan, folder: Path, parts: dict[str, str], key: str, report: RunReport, tell: Progress
+    scene: Scene, plan: Plan, folder: Path, parts: dict[str, str], key: str, report: RunReport, tell: Progress, say: Say
 ) -> Iterator[int]:
     """Simulate the frames that are not on disk yet, from the last checkpoint on; yields the last one that is there.
 
@@ -166,30 +202,13 @@ def _simulate(
     present = io.readable_states(folder, signature=key)
     checkpoint = folder / "last.ckpt"
     active = ActiveGrid() if plan.sleep is None else Sleeper(settings=plan.sleep, body=np.asarray(particles.body))
-    domain = vast_grid(scene.simulation.dx)
-    rule = substep_rule(
-        particles,
-        domain,
-        plan.table,
-        plan.config,
-        frames=max(frames, 1),
-        frame_dt=plan.frame_dt,
-        gravity=plan.gravity,
-        colliders=plan.colliders,
-        forces=plan.forces,
+    stages = stages_of(plan, frames)
+    run = partial(simulate_stages, plan, stages, active_grid=active)
+    config = stages[-1].rule.config
+    report.plan = plan_line(
+        scene, particles, plan.dx, substeps=stages[0].rule.first, integrator=stages[0].rule.config.integrator
     )
-    run = partial(
-        simulate,
-        domain=domain,
-        table=plan.table,
-        rule=rule,
-        frame_dt=plan.frame_dt,
-        gravity=plan.gravity,
-        colliders=plan.colliders,
-        contact=plan.contact,
-        forces=plan.forces,
-        active_grid=active,
-    )
+    say(report.plan)
     saved = io.resumed(checkpoint, (np.zeros((), np.int64), particles, active.memory()), parts=parts)
     last = 0 if saved is None else int(saved[0])
     missing = set(range(last + 1)) - present  # of a run without a checkpoint all frames from the first are made again
@@ -203,7 +222,7 @@ def _simulate(
         _checkpoint(checkpoint, 0, particles, active, parts)
     if repaired:
         warnings.warn(f"{folder}: states of {len(missing)} frames are missing or damaged; made again.", stacklevel=2)
-    report.modelled["integrator"] = rule.config.integrator
+    report.modelled["integrator"] = config.integrator
 
     def todo() -> Iterator[SimulatedFrame]:
         """Frames that are missing, from the start, then those after the checkpoint."""
@@ -233,7 +252,7 @@ def _simulate(
             tell("simulate", frame, frames)
         yield frame
     tell("simulate", frames, frames)
-    most = max((int(record["substeps"]) for frame, record in records.items() if frame), default=rule.first)
+    most = max((int(record["substeps"]) for frame, record in records.items() if frame), default=stages[0].rule.first)
     report.sizes |= {"substeps_per_frame": most, "last_grid": active.shape, "resumed_from_frame": last}
     report.health |= summary(records)
     driven = bool(plan.forces) or any(collider.moves for collider in plan.colliders)
@@ -277,8 +296,8 @@ def _draw(
 ) -> None:
     """Pose and render each saved state, once `states` says that it is there; remove it where it is not to be kept."""
     frames, gaussians = scene.simulation.frames, inputs.gaussians
-    focus = np.asarray(plan.particles.x).mean(0)
-    cameras = make_cameras(scene, inputs, focus)
+    matter = np.asarray(plan.particles.x)
+    cameras = make_cameras(scene, inputs, matter.mean(0), matter)
     background = jnp.asarray(scene.camera.background)
     config = render_config(scene)
 
@@ -287,15 +306,18 @@ def _draw(
     def pose_and_render(gaussians: Gaussians, particles: Particles, binding, camera: Camera):
         splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
         frame = render(splats, camera, config, background=background, outputs=("rgb",))
-        return jnp.clip(frame.rgb, 0, 1)
+        longest = safe_norm(splats.factors, axis=1) / jnp.exp(gaussians.log_scales)  # of each axis, relative to rest
+        return jnp.clip(frame.rgb, 0, 1), longest.max(1)
 
-    def draw(frame: int) -> jax.Array:
+    def draw(frame: int) -> tuple[jax.Array, jax.Array]:
         state = io.load_state(out / "states", frame, signature=key)
         particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, (state["x"], state["F_visual"]))
         return pose_and_render(gaussians, particles, plan.binding, cameras[frame])
 
     sheet_frames = np.unique(np.linspace(0, frames, _SHEET_FRAMES).round().astype(int))
     sheet: list[np.ndarray] = []
+    moving = np.isin(np.asarray(labels.object_id), [inputs.ids[n] for n, e in scene.objects.items() if not e.fixed])
+    stretches: dict[str, list[float]] = {"median": [], "99 of 100 below": [], "most": []}
 
     every, within = scene.output.states_every, report.times["draw"]
 
@@ -315,7 +337,10 @@ def _draw(
         for frame in range(frames + 1):
             there = there if there >= frame else wait_for(frame, there)
             tell("draw", frame, frames + 1)
-            picture = np.asarray(draw(frame))
+            picture, stretch = map(np.asarray, draw(frame))
+            record = np.quantile(stretch[moving], (0.5, 0.99, 1)) if moving.any() else np.ones(3)
+            for values, number in zip(stretches.values(), record.tolist()):
+                values.append(number)
             if not every or (frame % every and frame < frames):
                 io.remove_state(out / "states", frame)
             if frame in sheet_frames:
@@ -326,8 +351,11 @@ def _draw(
     tell("draw", frames + 1, frames + 1)
     wait_for(frames + 1, frames)  # for the health of the whole simulation
     if not every:
-        io.remove(out / "states" / "last.ckpt")
-    io.write_image(out / "contact_sheet.png", io.contact_sheet(sheet))
+        for name in ("last.ckpt", io.ROWS):
+            io.remove(out / "states" / name)
+    report.health["splat_stretch"] = stretches
+    report.sheet = io.contact_sheet(sheet)
+    io.write_image(out / "contact_sheet.png", report.sheet)
     _draw_objects(inputs, labels, cameras[0], sheet[0], out / "objects.png")
     for name in (*_FILES, "states"):
         report.files[name.split(".")[0]] = str(out / name)

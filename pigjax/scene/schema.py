@@ -8,19 +8,22 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from msgspec import field
+from msgspec import field, to_builtins
 from msgspec.structs import asdict, replace
 
 from pigjax import io
 from pigjax.core.arguments import checked
 from pigjax.core.checks import LARGEST_WHOLE, Limits, joined, shown, suggest
 from pigjax.core.errors import InputError, MissingFileError, SceneError
+from pigjax.core.regions import Region
 from pigjax.mpm.colliders import Box, Capsule, Collider, Cylinder, Plane, Sphere
 from pigjax.mpm.contact import broken_by
 from pigjax.mpm.materials import LAWS, PRESETS, Material, Parameters
 from pigjax.scene.accuracy import LEVELS, Accuracy, with_level
 from pigjax.scene.decode import Section, decode, merged
 from pigjax.scene.forces import AnyForce
+from pigjax.scene.regions import RegionSpec, regions_of
+from pigjax.scene.world import WorldSpec, axis_of, metres_of
 from pigjax.splatting.types import RenderConfig
 
 Triple = tuple[float, float, float]
@@ -32,6 +35,7 @@ _ANGLE = Limits(-1e6, 1e6, unit="degrees")
 _PIXELS = Limits(1, 16384, unit="px")
 _WEIGHT = Limits(-1e3, 1e3)
 _FRICTION = Limits(0, 1e6)
+INPUT_FILES = ("gaussians", "views", "images", "masks", "labels", "names")  # fields of `input` that hold paths
 
 
 class InputSpec(Section, frozen=True):
@@ -39,16 +43,21 @@ class InputSpec(Section, frozen=True):
 
     gaussians: str  # trained .ply
     views: str | None = None  # posed photos, which the masks belong to
+    images: str | None = None  # folder of the photos, where it is not the one that the cameras' file names
     masks: str | None = None  # folder of instance masks; None: `object_mask` beside the photos
+    labels: str | None = None  # labels.npz of `pigjax segment`, instead of masks
     names: str | None = None  # JSON of mask ids and names
     max_size: Annotated[int, Limits(1, 65536, unit="px")] | None = None  # of the photos' longer side
     drop_invalid: bool = False  # leave out Gaussians with NaN or infinity instead of refusing the file
     origin: Triple | None = None  # subtracted from Gaussians and cameras in float64, for georeferenced files [m]
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"  # axis of the world that points up
+    # axis or direction of the world that points up; nothing is turned (`world.up` turns)
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | Triple = "z"
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
-        """Masks belong to views."""
+        """Masks belong to views, and labels stand for them."""
+        yield "labels", self.labels is None or self.masks is None, "input.masks are given, too; remove one of the two"
         yield "masks", self.masks is None or self.views is not None, "masks belong to photos; give input.views, too"
+        yield "images", self.images is None or self.views is not None, "photos have cameras; give input.views, too"
 
 
 class SegmentationSpec(Section, frozen=True):
@@ -63,7 +72,8 @@ class SegmentationSpec(Section, frozen=True):
 class SimulationSpec(Section, frozen=True):
     """The simulation, in SI units."""
 
-    dx: Annotated[float, _LENGTH]  # grid spacing
+    # grid spacing; None: a sixteenth of the smallest moving object's size, see `default_dx`
+    dx: Annotated[float, _LENGTH] | None = None
     frames: Annotated[int, Limits(1, 100_000)] = 48
     fps: Annotated[float, Limits(0, 1e4, above=True, unit="1/s")] = 24.0
     gravity: Annotated[float | Triple, Limits(-1e6, 1e6, unit="m/s²")] = 9.81  # downwards, or a vector
@@ -96,7 +106,11 @@ class ClampSpec(Section, frozen=True):
 
 
 class CameraSpec(Section, frozen=True):
-    """Camera of the video: a view of the capture, or an orbit."""
+    """Camera of the video: a view of the capture, or an orbit.
+
+    Where the file gives neither and there are photos, it is the training view that shows the moving objects best,
+    cropped to them with room for their motion.
+    """
 
     view: str | None = None  # name of a photo whose camera is taken
     target: Annotated[Triple, _PLACE] | None = None  # centre of the orbit; None: middle of the moving objects
@@ -108,6 +122,12 @@ class CameraSpec(Section, frozen=True):
     width: Annotated[int, _PIXELS] = 512
     height: Annotated[int, _PIXELS] = 512
     background: Annotated[float | Triple, Limits(0, 1)] = 0.0
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the file says nothing of where the camera is."""
+        names = ("view", "target", "radius", "elevation", "start", "sweep", "field_of_view")
+        return all(getattr(self, name) == getattr(CameraSpec(), name) for name in names)
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """A photo's camera has a place of its own."""
@@ -140,12 +160,25 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     The ranges of a material's numbers are those of its law: see `materials.LIMITS`.
     """
 
-    id: Annotated[int, Limits(0, 2**31 - 1)] | None = None  # in the masks; None: looked up by the object's name
+    # in masks or labels; None: looked up by the object's name, or a new one for an object that is chosen otherwise
+    id: Annotated[int, Limits(0, 2**31 - 1)] | None = None
+    gaussians: str | None = None  # file of its own, placed into the scene as the fields below say
+    within: RegionSpec | None = None  # Gaussians with their centres here are its own, whatever masks and labels say
+    # outliers, which never become matter: "parts" cuts what lies apart from it, "largest" all but its largest part
+    keep: Literal["parts", "largest", "all"] = "parts"
+    height: str | None = None  # its true height with a unit, as "0.6 m": gives the scale of the whole scene
+    offset: Annotated[Triple, _PLACE] = (0.0, 0.0, 0.0)  # from where its Gaussians are
+    rotation: Annotated[Triple, _ANGLE] = (0.0, 0.0, 0.0)  # axis times angle, about its middle: [0, 0, 90] about z
+    scale: Annotated[float, Limits(0, 1e6, above=True)] = 1.0  # times its size, about its middle
+    copies: Annotated[list[Triple], _PLACE] = field(default_factory=list)  # offsets of more of it, each its own object
+    removed: bool = False  # its splats are left out, as if it had never stood there
     fixed: bool = False  # a still collider made from its own splats
     friction: Annotated[float, _FRICTION] = 0.5  # Coulomb's coefficient of a fixed object
     material: str | None = None
     model: str | None = None
     velocity: Annotated[Triple, _SPEED] = (0.0, 0.0, 0.0)
+    angular_velocity: Annotated[Triple, Limits(-1e6, 1e6, unit="rad/s")] = (0.0, 0.0, 0.0)  # about its centre of mass
+    start: Annotated[float, Limits(0, 1e6, unit="s")] = 0.0  # simulated time until which it stands still, as a rock
     density: Annotated[float, Limits(unit="kg/m³")] | None = None
     young: Annotated[float, Limits(unit="Pa")] | None = None
     poisson: Annotated[float, Limits()] | None = None
@@ -165,11 +198,31 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     fibre_elevation: Annotated[float, Limits(unit="rad")] | None = None
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
-        """A fixed object neither moves nor has a material."""
+        """A fixed object neither moves nor has a material, and one that is removed is not there."""
+        if self.removed:
+            rule = "an object that is removed has none; remove one of the two"
+            for name in ("material", "model"):
+                yield name, getattr(self, name) is None, rule
+            yield "fixed", not self.fixed, rule
         if self.fixed:
             for name in ("material", "model", *_NUMBERS):
                 yield name, getattr(self, name) is None, "a fixed object has no material; remove one of the two"
-            yield "velocity", not any(self.velocity), "a fixed object does not move; remove one of the two"
+            for name in ("velocity", "angular_velocity"):
+                yield name, not any(getattr(self, name)), "a fixed object does not move; remove one of the two"
+            yield "start", self.start == 0, "a fixed object does not move; remove one of the two"
+        both = self.gaussians is not None and (self.within is not None or self.id is not None)
+        yield "gaussians", not both, "a file of its own needs no id and no region; remove one of the two"
+
+    @property
+    def moves(self) -> bool:
+        """Whether it is matter."""
+        return not (self.fixed or self.removed)
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether its Gaussians are not where the scene's file has them, or come from another file."""
+        turned = any((*self.offset, *self.rotation)) or self.scale != 1
+        return turned or self.gaussians is not None or bool(self.copies) or self.removed
 
     def to_material(self, name: str) -> Material:
         """The material of these fields.
@@ -262,8 +315,9 @@ class Scene(Section, frozen=True):
     """A whole scene file, one field for each of its tables. Lengths in m, times in s, angles in degrees."""
 
     input: InputSpec  # files
-    simulation: SimulationSpec  # grid, frames, gravity
     objects: dict[str, ObjectSpec]  # by name
+    simulation: SimulationSpec = SimulationSpec()  # grid, frames, gravity
+    world: WorldSpec = WorldSpec()  # axes and units of the files
     segmentation: SegmentationSpec = SegmentationSpec()  # thresholds of the vote
     clamp: ClampSpec = ClampSpec()  # bounds and weights of the eigen-clamp
     camera: CameraSpec = CameraSpec()  # of the video
@@ -275,12 +329,13 @@ class Scene(Section, frozen=True):
     spheres: dict[str, SphereSpec] = field(default_factory=dict)  # colliders by name
     capsules: dict[str, CapsuleSpec] = field(default_factory=dict)  # colliders by name
     cylinders: dict[str, CylinderSpec] = field(default_factory=dict)  # colliders by name
+    pinned: dict[str, RegionSpec] = field(default_factory=dict)  # regions by name, in which matter does not move
     forces: dict[str, AnyForce] = field(default_factory=dict)  # beside gravity, by name
     folder: str = "."  # set by `load_scene`; the base of relative paths
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """Something moves, objects can be told apart, contact has its integrator, and pictures have a size."""
-        moving = sum(not spec.fixed for spec in self.objects.values())
+        moving = sum(spec.moves for spec in self.objects.values())
         yield "objects", moving > 0, "none moves; give one a material"
         owners: dict[int, str] = {}
         for name, spec in self.objects.items():
@@ -288,15 +343,30 @@ class Scene(Section, frozen=True):
                 owner = owners.setdefault(spec.id, name)
                 rule = f"{spec.id} is the id of objects.{joined(owner)}, too; each object has an id of its own"
                 yield joined("objects", name, "id"), owner == name, rule
-        moving_names = [name for name, spec in self.objects.items() if not spec.fixed]
+        moving_names = [name for name, spec in self.objects.items() if spec.moves]
         for name, force in self.forces.items():
             for entry in force.objects or ():
                 known = entry in moving_names
                 rule = f"{entry!r} is no object that moves; {suggest(entry, moving_names)}"
                 yield joined("forces", name, "objects"), known, rule
         has_views = self.input.views is not None
-        yield "input.views", has_views or len(self.objects) == 1, "several objects need photos with masks; give them"
+        labelled = has_views or self.input.labels is not None
+        asked = [spec for spec in self.objects.values() if spec.gaussians is None and spec.within is None]
+        rule = (
+            "several objects need photos with masks, input.labels, or a region each (objects.<name>.within); give them"
+        )
+        yield "input.views", labelled or len(asked) <= 1, rule
         yield "camera.view", has_views or self.camera.view is None, "photos have cameras; give input.views, or an orbit"
+        tall = [name for name, spec in self.objects.items() if spec.height is not None]
+        known = self.world.units_per_metre is None
+        yield joined("objects", *tall[:1], "height"), known or not tall, "world.units_per_metre is given; remove one"
+        yield joined("objects", *tall[1:2], "height"), len(tall) < 2, f"objects.{joined(*tall[:1])} has one; remove one"
+        within = any(spec.within is not None for spec in self.objects.values())
+        rule = "regions of objects are in metres, which the height would have to give; give world.units_per_metre"
+        yield joined("objects", *tall[:1], "height"), not (tall and within), rule
+        up = self.input.up
+        rule = "world.up turns the scene so that z points up; remove input.up"
+        yield "input.up", self.world.up is None or up == "z", rule
         in_contact = moving > 1 and self.simulation.contact_friction is not None
         broken = broken_by(self.simulation.integrator) if in_contact else None
         yield "simulation.integrator", broken is None, f"{broken}, or remove simulation.contact_friction"
@@ -308,6 +378,14 @@ class Scene(Section, frozen=True):
     def path(self, name: str) -> Path:
         """A path of the file, seen from the working directory."""
         return Path(self.folder) / name
+
+    def pins(self) -> tuple[Region, ...]:
+        """Regions in which matter does not move.
+
+        Raises:
+            SceneError: a number is out of range.
+        """
+        return regions_of("pinned", self.pinned)
 
     def colliders(self) -> tuple[Collider, ...]:
         """The colliders of the file, from `planes` to `cylinders`.
@@ -361,6 +439,15 @@ def read_file(path: Path, what: str) -> dict[str, Any]:
         raise SceneError(str(error)) from error
 
 
+def _check_up(scene: Scene) -> None:
+    for section, up in (("input", scene.input.up), ("world", scene.world.up)):
+        if up is not None and up != "auto":
+            try:
+                axis_of(up)
+            except InputError as error:
+                raise SceneError(f"{section}.{error}") from None
+
+
 def scene_from(
     values: dict[str, Any], *, folder: str | Path = ".", where: str = "scene", accuracy: str | None = None
 ) -> Scene:
@@ -376,14 +463,44 @@ def scene_from(
         raise SceneError(f"{where}: accuracy = {shown(level)}: {suggest(level, LEVELS)}.")
     try:
         scene = decode(with_level(values, level), Scene, folder=str(folder))
-        dx = scene.simulation.dx * LEVELS[level].coarsening
-        scene = replace(scene, simulation=replace(scene.simulation, dx=dx))
+        if (dx := scene.simulation.dx) is not None:
+            scene = replace(scene, simulation=replace(scene.simulation, dx=dx * LEVELS[level].coarsening))
         for name, spec in scene.objects.items():
-            if not spec.fixed:
+            if spec.moves:
                 spec.to_material(name)
+            if spec.within is not None:
+                spec.within.to_region(joined("objects", name, "within"))
+            if spec.height is not None:
+                metres_of(spec.height, joined("objects", name, "height"))
+        _check_up(scene)
         scene.colliders()
+        scene.pins()
         for name, force in scene.forces.items():
             force.to_force(joined("forces", name))
     except SceneError as error:
         raise SceneError(f"{where}: {error}") from error.__cause__
     return scene
+
+
+def values_of(scene: Scene, folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """Contents of a scene file in another folder that asks for the same: every field with its value.
+
+    The level of accuracy is "standard", since the fields hold the values that another level gave them.
+    """
+    values: dict[str, Any] = _given(to_builtins(scene))
+    values.pop("folder")
+    values["accuracy"] = "standard"
+    for name in INPUT_FILES:
+        if name in values["input"]:
+            values["input"][name] = os.path.relpath(scene.path(values["input"][name]), folder)
+    for entry in values["objects"].values():
+        if "gaussians" in entry:
+            entry["gaussians"] = os.path.relpath(scene.path(entry["gaussians"]), folder)
+    return values
+
+
+def _given(value: Any) -> Any:
+    """Without fields that are None, for which TOML has no form."""
+    if not isinstance(value, dict):
+        return value
+    return {key: _given(entry) for key, entry in value.items() if entry is not None}

@@ -10,6 +10,7 @@ lists all pairs at once (Kerbl et al. 2023, appendix C), which needs a capacity.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -19,10 +20,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.arrays import static_field
+from pigjax.core.backend import takes_warp
 from pigjax.core.camera import Camera
 from pigjax.splatting.types import Projected, RenderConfig
 
 SHAPE_COLUMNS = 6  # of a splat's row: x, y, conic xx, xy, yy, log opacity; features follow
+LoopState = tuple[Float[Array, "..."], ...]  # of a loop over lists: planes of each tile, the transmittance first
 _KEY_LIMIT = 2**31  # tile and slot share one int32 sort key below it
 _DEPTH_BITS = 30  # of float32 above the near plane: 128 octaves
 
@@ -44,6 +47,7 @@ class BlendConfig(eqx.Module):
     transmittance_min: float = static_field()
     near: float = static_field()  # [m]
     surface: bool = static_field()  # also return the depth at which the transmittance falls below a threshold
+    warp: bool = static_field(default=False)  # lists and blending by Warp kernels
 
     @property
     def columns(self) -> int:
@@ -96,13 +100,14 @@ def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: b
     on_cpu = jax.default_backend() == "cpu"
     tiles = -(-camera.width // config.tile_size) * -(-camera.height // config.tile_size)
     chunk = 64 if 6 * count > 32 * tiles else 16
-    limit = config.slots or 2 ** (17 if on_cpu else 21) // config.bands
+    warp = takes_warp(config.backend, config.differentiation)
+    limit = config.slots or 2 ** (17 if on_cpu else 23 if warp else 21) // config.bands
     return BlendConfig(
         width=camera.width,
         height=camera.height,
         tile=config.tile_size,
         chunk=config.chunk or chunk,
-        slots=slots_of(count, tiles, config.capacity, limit),
+        slots=slots_of(count, tiles, config.capacity, limit, one_key=not warp),
         capacity=config.capacity,
         tiles_at_once=config.tiles_at_once or (1 if on_cpu else 2048),
         by_products=not on_cpu,
@@ -112,15 +117,17 @@ def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: b
         transmittance_min=config.transmittance_min,
         near=config.near or 0.0,  # 0 orders every depth that occurs
         surface=surface,
+        warp=warp,
     )
 
 
-def slots_of(count: int, tiles: int, capacity: int | None, limit: int) -> int:
+def slots_of(count: int, tiles: int, capacity: int | None, limit: int, *, one_key: bool = True) -> int:
     """Static size of a pass: 6 pairs per splat, at most `limit` and the capacity, and at least the number of tiles.
 
-    A splat that covers every tile has to fit into one pass. The last bound keeps (tile, slot) within one sort key.
+    A splat that covers every tile has to fit into one pass. With `one_key`, (tile, slot) stay within one sort key.
     """
-    return max(tiles, min(6 * count, limit, capacity or limit, (_KEY_LIMIT - 1) // (tiles + 1)))
+    most = (_KEY_LIMIT - 1) // (tiles + 1) if one_key else limit
+    return max(tiles, min(6 * count, limit, capacity or limit, most))
 
 
 def bin_splats(projected: Projected, config: BlendConfig) -> Boxes:
@@ -196,6 +203,16 @@ def list_pass(
     following = jnp.where(jnp.any(beyond), jnp.argmax(beyond), len(ranks)).astype(jnp.int32)
     pairs = jnp.where(ranks < following, pairs, 0)
     listed = pairs.sum(dtype=jnp.int32)
+    if config.warp:
+        from pigjax.splatting.warp_binning import slots_by_tile
+
+        ends = jnp.where(ranks < following, end, listed)
+        everywhere = jnp.ones(config.tiles, bool) if open_tiles is None else open_tiles
+        box = boxes.low, boxes.size
+        settings = (config.columns, config.tile), _least_exponent(config)
+        rank, tile = slots_by_tile(shapes, *box, ends, end - pairs, everywhere, *settings, slots)
+        start = jnp.searchsorted(tile, jnp.arange(config.tiles + 1, dtype=jnp.int32)).astype(jnp.int32)
+        return TileLists(rank, tile, start, following, listed)
 
     slot = jnp.arange(slots, dtype=jnp.int32)
     rank = jnp.repeat(ranks, pairs, total_repeat_length=slots)
@@ -217,6 +234,39 @@ def list_pass(
         tile, slot = lax.sort((tile, slot), num_keys=2, is_stable=False)
     start = jnp.searchsorted(tile, jnp.arange(config.tiles + 1, dtype=jnp.int32)).astype(jnp.int32)
     return TileLists(rank[slot], tile, start, following, listed)
+
+
+def run_passes(
+    table: Float[Array, "n f"], boxes: Boxes, config: BlendConfig, state: LoopState, visit: Callable
+) -> tuple[LoopState, Int[Array, ""]]:
+    """Run `visit(lists, state)` for one pass after the other; the state starts with the transmittance of each tile.
+
+    Returns:
+        The last state, and the splat/tile pairs that the capacity left out.
+    """
+    shapes = lax.stop_gradient(table[:, :SHAPE_COLUMNS])
+    count = shapes.shape[0]
+
+    def open_tiles(state):
+        return jnp.max(lax.stop_gradient(state[0]), 1) > config.transmittance_min
+
+    def unfinished(carry):
+        first, _, latest, state = carry
+        return (first < count) & (latest > 0) & jnp.any(open_tiles(state))
+
+    def one(carry):
+        first, listed, _, state = carry
+        budget = None if config.capacity is None else config.capacity - listed
+        with jax.named_scope("bin"):
+            lists = list_pass(shapes, boxes, first, open_tiles(state), config, config.slots, budget)
+        return lists.next, listed + lists.listed, lists.listed, visit(lists, state)
+
+    zero = jnp.zeros((), jnp.int32)
+    first, _, _, state = lax.while_loop(unfinished, one, (zero, zero, zero + 1, state))
+    if config.capacity is None:
+        return state, zero
+    left = jnp.where(jnp.arange(count) >= first, pairs_in_open_tiles(boxes, open_tiles(state), config), 0)
+    return state, count_pairs(left)
 
 
 def pairs_in_open_tiles(boxes: Boxes, open_tiles: Bool[Array, "tiles"] | None, config: BlendConfig) -> Int[Array, "n"]:
@@ -295,6 +345,9 @@ def _reaches(
 
     inside = (x0 <= 0) & (x1 >= 0) & (y0 <= 0) & (y1 >= 0)
     edge = jnp.minimum(jnp.minimum(along_y(x0), along_y(x1)), jnp.minimum(along_x(y0), along_x(y1)))
-    # the margin covers the rounding of the blending loop
-    floor = math.log(config.alpha_min * 0.999) if config.alpha_min > 0 else -math.inf
-    return peak - jnp.where(inside, 0.0, edge) >= floor
+    return peak - jnp.where(inside, 0.0, edge) >= _least_exponent(config)
+
+
+def _least_exponent(config: BlendConfig) -> float:
+    """Log of the least alpha that is listed; its margin covers the rounding of the blending loop."""
+    return math.log(config.alpha_min * 0.999) if config.alpha_min > 0 else -math.inf

@@ -34,18 +34,15 @@ from pigjax.splatting.binning import (
     SHAPE_COLUMNS,
     BlendConfig,
     Boxes,
+    LoopState,
     TileLists,
-    count_pairs,
-    list_pass,
-    pairs_in_open_tiles,
     rows_in_order,
+    run_passes,
     untile,
 )
 from pigjax.splatting.scan_compositor import composite_by_scan
 from pigjax.splatting.sharding import shard_rows
 from pigjax.splatting.types import Projected
-
-LoopState = tuple[Float[Array, "..."], ...]  # of a loop over lists: planes of each tile, the transmittance first
 
 
 class Blended(NamedTuple):
@@ -82,6 +79,8 @@ def composite(
     table = rows_in_order(projected, boxes, features, ones, *extra)
     tau = lax.stop_gradient(jnp.asarray(tau, table.dtype))
     of_tiles = composite_tiles if reverse else composite_by_scan
+    if config.warp and reverse:
+        from pigjax.splatting.warp_compositor import composite_by_warp as of_tiles
     planes, overflow = (of_tiles if config.shards == 1 else shard_rows(of_tiles))(table, boxes, tau, config)
     image, channels = untile(planes, config), features.shape[1]
     return Blended(image[..., channels], image[..., :channels], image[..., -1] if config.surface else None, overflow)
@@ -134,7 +133,7 @@ def _forward(
         return tuple(_ungrouped(planes, config) for planes in state)
 
     start = jnp.ones((config.tiles, pixels), dtype), jnp.zeros((config.tiles, channels, pixels), dtype)
-    (_, planes), overflow = _run_passes(table, boxes, config, start, composite_pass)
+    (_, planes), overflow = run_passes(table, boxes, config, start, composite_pass)
     return planes, overflow
 
 
@@ -193,45 +192,12 @@ def _composite_bwd(config: BlendConfig, saved: Any, cotangents: Any) -> tuple[Fl
 
     # transmittance and running sum of each pixel, and the cotangent of the table
     start = (jnp.ones((config.tiles, pixels), dtype), jnp.zeros((config.tiles, pixels), dtype), jnp.zeros_like(table))
-    (*_, of_table), _ = _run_passes(table, boxes, config, start, pass_cotangent)
+    (*_, of_table), _ = run_passes(table, boxes, config, start, pass_cotangent)
     no_cotangent = jax.tree.map(lambda index: np.zeros(index.shape, jax.dtypes.float0), boxes)
     return of_table, no_cotangent, jnp.zeros_like(tau)
 
 
 composite_tiles.defvjp(_composite_fwd, _composite_bwd)
-
-
-def _run_passes(
-    table: Float[Array, "n f"], boxes: Boxes, config: BlendConfig, state: LoopState, visit: Callable
-) -> tuple[LoopState, Int[Array, ""]]:
-    """Run `visit(lists, state)` for one pass after the other; the state starts with the transmittance of each tile.
-
-    Returns:
-        The last state, and the splat/tile pairs that the capacity left out.
-    """
-    shapes = lax.stop_gradient(table[:, :SHAPE_COLUMNS])
-    count = shapes.shape[0]
-
-    def open_tiles(state):
-        return jnp.max(lax.stop_gradient(state[0]), 1) > config.transmittance_min
-
-    def unfinished(carry):
-        first, _, latest, state = carry
-        return (first < count) & (latest > 0) & jnp.any(open_tiles(state))
-
-    def one(carry):
-        first, listed, _, state = carry
-        budget = None if config.capacity is None else config.capacity - listed
-        with jax.named_scope("bin"):
-            lists = list_pass(shapes, boxes, first, open_tiles(state), config, config.slots, budget)
-        return lists.next, listed + lists.listed, lists.listed, visit(lists, state)
-
-    zero = jnp.zeros((), jnp.int32)
-    first, _, _, state = lax.while_loop(unfinished, one, (zero, zero, zero + 1, state))
-    if config.capacity is None:
-        return state, zero
-    left = jnp.where(jnp.arange(count) >= first, pairs_in_open_tiles(boxes, open_tiles(state), config), 0)
-    return state, count_pairs(left)
 
 
 def _walk_lists(

@@ -6,6 +6,8 @@ stands. `compositor` is faster and has a hand-written backward pass, but gives o
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Integer
@@ -13,9 +15,17 @@ from jaxtyping import Array, Float, Int, Integer
 from pigjax.core.arrays import matmul
 from pigjax.core.camera import Camera
 from pigjax.splatting.alpha import Blend, may_be_surface
-from pigjax.splatting.binning import BlendConfig, bin_splats, blend_config, into_tiles, rows_in_order, untile
+from pigjax.splatting.binning import (
+    BlendConfig,
+    bin_splats,
+    blend_config,
+    into_tiles,
+    list_pass,
+    rows_in_order,
+    untile,
+)
 from pigjax.splatting.projection import project_splats
-from pigjax.splatting.scan_compositor import Chunks, all_chunks, scan_chunks
+from pigjax.splatting.scan_compositor import Chunks, all_chunks, scan_chunks, static_capacity
 from pigjax.splatting.types import RenderConfig, Splats
 
 _LEAST_PRESENCE = 1e-6  # below it a pixel has no surface; keeps its square within float32
@@ -74,7 +84,8 @@ def credits_of_candidates(
 ) -> Float[Array, "n j"]:
     """Sum of alpha·T of each splat over the pixels whose id is a candidate of the splat.
 
-    Chunks behind a tile's last splat with candidates are not blended, so few candidates cost little.
+    Chunks behind a tile's last splat with candidates are not blended, so few candidates cost little. By Warp kernels
+    (`RenderConfig.backend`) the sums have no derivative.
 
     Args:
         splats: the scene.
@@ -83,6 +94,9 @@ def credits_of_candidates(
         mask: id of each pixel.
         candidates: ids of each splat; a candidate of -1 gets nothing.
     """
+    blending = blend_config(camera, config, len(splats), surface=True)
+    if blending.warp:
+        return _credits_by_warp(splats, camera, config, blending, mask, candidates)
     chunks, blending, _ = _chunks_of(splats, camera, config)
     asked = (candidates[chunks.splat] >= 0) & chunks.valid[..., None]
     index = jnp.arange(chunks.tile.shape[0])
@@ -98,10 +112,31 @@ def credits_of_candidates(
     return credits.at[chunks.splat].add(jnp.where(asked, parts, 0.0))
 
 
+def _credits_by_warp(
+    splats: Splats,
+    camera: Camera,
+    config: RenderConfig,
+    blending: BlendConfig,
+    mask: Integer[Array, "h w"],
+    candidates: Int[Array, "n j"],
+) -> Float[Array, "n j"]:
+    """By a kernel that walks the same lists: those of all splats, in one pass."""
+    from pigjax.splatting.warp_compositor import credits_by_warp
+
+    projected = project_splats(splats, camera, config)
+    boxes, slots = bin_splats(projected, blending), static_capacity(len(splats), blending)
+    shapes = projected.shapes[boxes.order]
+    lists = list_pass(shapes, boxes, 0, None, blending, slots)
+    ids = into_tiles(mask.astype(jnp.int32), -1, blending)
+    return credits_by_warp(projected, boxes, candidates, ids, lists, blending)
+
+
 def _chunks_of(splats: Splats, camera: Camera, config: RenderConfig) -> tuple[Chunks, BlendConfig, Int[Array, ""]]:
     """Chunks of a view whose only feature is the depth, its static settings, and the pairs dropped."""
     with jax.named_scope("project"):
         projected = project_splats(splats, camera, config)
+    # by XLA, since both modes differentiate these lists' chunks
+    config = dataclasses.replace(config, backend="xla")
     blending = blend_config(camera, config, len(splats), surface=True)
     with jax.named_scope("bin"):
         boxes = bin_splats(projected, blending)

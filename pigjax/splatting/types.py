@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from pigjax.core.arrays import real_field, static_field
-from pigjax.core.checks import LARGEST_WHOLE, Limits, check_axes, check_fields
+from pigjax.core.arrays import static_field
+from pigjax.core.backend import BACKENDS, check_backend
+from pigjax.core.checks import LARGEST_WHOLE, Limits, check_fields
 from pigjax.core.errors import InputError
 from pigjax.core.extent import Extent, scene_extent
-from pigjax.core.gaussians import Gaussians
+from pigjax.core.gaussians import Gaussians, Splats
 from pigjax.core.linalg import quat_to_matrix
 
 __all__ = [
@@ -27,27 +28,6 @@ __all__ = [
     "gaussian_factors",
 ]
 OUTPUTS = ("rgb", "alpha", "depth", "surface_depth", "object_weights", "normals", "features")
-
-
-class Splats(eqx.Module):
-    """Posed Gaussians, ready to draw. The covariance of each is factors @ factorsᵀ.
-
-    Raises:
-        InputError: an array has not its axes, or is not as long as the others.
-    """
-
-    means: Float[Array, "n 3"] = real_field()  # [m]
-    factors: Float[Array, "n 3 3"] = real_field()  # [m]
-    opacities: Float[Array, "n"] = real_field()  # in [0, 1]
-    sh: Float[Array, "n k 3"] = real_field()  # spherical harmonics, k = (degree + 1)²
-    # rotation of the matter since rest; view-dependent colour turns with it
-    sh_rotations: Float[Array, "n 3 3"] | None = real_field(default=None)
-
-    def __check_init__(self) -> None:
-        check_axes(self)
-
-    def __len__(self) -> int:
-        return self.means.shape[0]
 
 
 class Projected(eqx.Module):
@@ -94,7 +74,7 @@ class RenderConfig(eqx.Module):
     tile_size: int = static_field(default=16, limits=Limits(1, 1024, unit="px"))
     # splat/tile pairs per image, far splats dropped first; None: unlimited ("forward": 16 per splat)
     capacity: int | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
-    # splat/tile pairs binned in one pass; None: 2¹⁷ on a CPU, 2²¹ elsewhere, divided by `bands`
+    # splat/tile pairs binned in one pass; None: 2¹⁷ on a CPU, 2²¹ elsewhere, 2²³ by Warp, divided by `bands`
     slots: int | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
     sh_degree: int | None = static_field(default=None, limits=Limits(0, 3))  # None: the degree that the splats have
     # fainter contributions are skipped
@@ -118,9 +98,13 @@ class RenderConfig(eqx.Module):
     # of differentiation (jvp, hessian) goes through; it is slower, and its lists have a static capacity: 16 pairs per
     # splat unless given (`required_capacity` finds it). Pairs that do not fit are counted in Frame.overflow
     differentiation: str = static_field(default="reverse", choices=("reverse", "forward"))
+    # of lists and blending: "xla", "warp" (extra `gpu`: CUDA devices and CPUs), or "auto": Warp on CUDA devices where
+    # it is installed
+    backend: str = static_field(default="auto", choices=BACKENDS)
 
     def __check_init__(self) -> None:
         check_fields(self)
+        check_backend("RenderConfig", self.backend, self.differentiation)
         if self.alpha_min >= self.alpha_max:
             raise InputError(
                 f"RenderConfig.alpha_min = {self.alpha_min}: must be < alpha_max = {self.alpha_max}, or none is drawn."

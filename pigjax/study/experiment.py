@@ -26,6 +26,7 @@ from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.checks import suggest
 from pigjax.core.errors import InputError, SceneError
+from pigjax.core.regions import Region
 from pigjax.coupling.binding import Binding, at_frame, deform
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, Health, Particles, Trajectory, fit_grid, vast_grid
@@ -35,6 +36,7 @@ from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.forces import Force
 from pigjax.mpm.materials import Material, MaterialTable, Parameters
 from pigjax.mpm.timestep import stable_dt, substep_rule
+from pigjax.scene.arrangement import arrange
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, read_inputs, render_config, segment
 from pigjax.scene.schema import Scene
 from pigjax.segmentation import Labels
@@ -77,6 +79,7 @@ class Experiment(eqx.Module):
     rows: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)  # of the table, by moving object
     solids: tuple[str, ...] = eqx.field(static=True)  # names of the colliders: "objects.table", "planes.ground"
     pushes: tuple[str, ...] = eqx.field(static=True)  # names of the forces: "forces.breeze"
+    pins: tuple[Region, ...] = ()  # in which matter does not move
 
     def with_parameters(self, values: Mapping[str, Any]) -> Experiment:
         """The same experiment with other numbers, by the names of the scene file.
@@ -155,6 +158,7 @@ class Experiment(eqx.Module):
             colliders=self.colliders,
             contact=self.contact,
             forces=self.forces,
+            pins=self.pins,
         )
         return Outcome(self, end, trajectory, health)
 
@@ -201,7 +205,8 @@ class Experiment(eqx.Module):
 
     def _thing(self, section: str, entry: str) -> Collider | Force | None:
         """The collider or force of a name; None for all else."""
-        things = dict(zip((*self.solids, *self.pushes), (*self.colliders, *self.forces)))
+        things: dict[str, Collider | Force] = dict(zip(self.solids, self.colliders))
+        things |= zip(self.pushes, self.forces)
         return things.get(f"{section}.{entry}")
 
     def _with(self, name: str, value: Array) -> Experiment:
@@ -213,9 +218,10 @@ class Experiment(eqx.Module):
         if section == "simulation":
             return self._with_simulation(field, value)
         if (thing := self._thing(section, entry)) is not None:
-            kind = "forces" if section == "forces" else "colliders"
-            made = replace(thing, **change)
-            return replace(self, **{kind: tuple(made if own is thing else own for own in getattr(self, kind))})
+            made: Any = replace(thing, **change)
+            if section == "forces":
+                return replace(self, forces=tuple(made if own is thing else own for own in self.forces))
+            return replace(self, colliders=tuple(made if own is thing else own for own in self.colliders))
         rows = np.array(dict(self.rows)[entry])
         particles = self.particles
         if field == "velocity":
@@ -281,13 +287,14 @@ def experiment(
     with warnings.catch_warnings():
         if alone:
             warnings.filterwarnings("ignore", message="the scene says nothing of")
-        plan = make_plan(scene, inputs, segment(scene, inputs))
+        scene, inputs, labels = arrange(scene, inputs, segment(scene, inputs))
+        plan = make_plan(scene, inputs, labels)
     if alone:
         inputs, plan = _only_named(inputs, plan)
     made = _assemble(scene, inputs, plan)
     for name, count in (regions or {}).items():
         made = _split_object(made, name, count)
-    return _fitted(made, scene.simulation.dx, [{}, *extremes], margin)
+    return _fitted(made, plan.dx, [{}, *extremes], margin)
 
 
 def _only_named(inputs: Inputs, plan: Plan) -> tuple[Inputs, Plan]:
@@ -313,24 +320,28 @@ def _of_some(labels: Labels, kept: Bool[np.ndarray, "n"]) -> Labels:
 
 def _assemble(scene: Scene, inputs: Inputs, plan: Plan) -> Experiment:
     spec, camera = scene.simulation, scene.camera
+    for name, entry in scene.objects.items():
+        if entry.start > 0:
+            raise SceneError(f"objects.{name}.start = {entry.start}: in a study all objects start at once; remove it.")
     moving = [name for name, entry in scene.objects.items() if not entry.fixed]
     sections = {name: getattr(scene, name) for name in ("planes", "boxes", "spheres", "capsules", "cylinders")}
     solids = [f"objects.{name}" for name, entry in scene.objects.items() if entry.fixed]
     solids += [f"{section}.{name}" for section, entries in sections.items() for name in entries]
-    dtype = plan.particles.x.dtype
+    dtype, matter = plan.particles.x.dtype, np.asarray(plan.particles.x)
     return Experiment(
         gaussians=inputs.gaussians,
         particles=plan.particles,
         table=plan.table,
         binding=plan.binding,
-        grid=vast_grid(spec.dx),
+        grid=vast_grid(plan.dx),
         colliders=plan.colliders,
         forces=plan.forces,
+        pins=plan.pins,
         contact=plan.contact,
         gravity=jnp.asarray(plan.gravity, dtype),
         frame_dt=jnp.asarray(plan.frame_dt, dtype),
         clamp=plan.clamp,
-        cameras=make_cameras(scene, inputs, np.asarray(plan.particles.x).mean(0)),
+        cameras=make_cameras(scene, inputs, matter.mean(0), matter),
         background=jnp.asarray(camera.background, dtype),
         config=plan.config,
         render=replace(render_config(scene), bands=1),  # devices share rows of a sweep, or particles

@@ -172,7 +172,7 @@ def _trial(study: Study, rows: Sequence[Row], *, soft: bool) -> tuple[Callable[.
         raise SceneError("parameters: thresholds of the vote decide what is simulated: study them apart from the rest.")
     options = study.objective.options
     if study.objective.function == "aim":
-        moving = [name for name, spec in scene.objects.items() if not spec.fixed]
+        moving = [name for name, spec in scene.objects.items() if spec.moves]
         check_aim(options["object"], options.get("frame", -1), moving, scene.simulation.frames)
     objective = objective_of(study.objective.function, options, Path(study.folder))
     start = {name: own.start for name, own in study.parameters.items() if own.start is not None}

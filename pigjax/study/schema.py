@@ -17,7 +17,7 @@ from pigjax.core.arguments import checked
 from pigjax.core.checks import LARGEST_WHOLE, Limits, joined, suggest
 from pigjax.core.errors import SceneError
 from pigjax.scene.decode import Section, decode, merged
-from pigjax.scene.schema import Scene, read_file, scene_from
+from pigjax.scene.schema import INPUT_FILES, Scene, read_file, scene_from
 
 Value = float | tuple[float, ...]
 MOST_ROWS = 1_000_000  # of a sweep
@@ -203,7 +203,7 @@ class Study(Section, frozen=True):
                 scene_from(changed)
                 values = changed
         here = Path(self.folder) / Path(self.scene).parent
-        for name in ("gaussians", "views", "masks", "names"):
+        for name in INPUT_FILES:
             if name in values["input"]:
                 values["input"][name] = os.path.relpath(here / values["input"][name], folder)
         return values

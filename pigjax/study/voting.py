@@ -117,6 +117,7 @@ def voting(scene: Scene, *, temperature: float | None = None) -> Voting:
         raise SceneError("input.views is missing: a study of segmentation needs posed photos with masks.")
     check_ids_occur(inputs.ids, inputs.views.masks)
     views = inputs.views.masked
+    assert views.masks is not None
     masks, number = _compact(views.masks, inputs.ids.values())
     views = eqx.tree_at(lambda v: v.masks, views, masks)
     train, held = views.training, views.held_out

@@ -129,6 +129,7 @@ def test_doctor_tells_versions_devices_and_extras_and_finds_nothing_wrong(monkey
     for part in (
         f"jax: {jax.__version__}",
         "device: ",
+        "kernels: ",
         "memory: ",
         "ffmpeg: ",
         "extra formats: ",

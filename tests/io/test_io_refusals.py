@@ -52,8 +52,9 @@ def pose(number, name, quat="1 0 0 0"):
 @pytest.mark.parametrize(
     "field",
     [
-        {"is_fisheye": True},
-        {"k3": 0.1},
+        {"orthographic": True},
+        {"k3": "long"},
+        {"b1": 0.1},
         {"k5": -0.1},
         {"p1": float("nan")},
         {"distortion_params": [0, 0, 0.1, 0]},
@@ -87,7 +88,7 @@ def test_inria_camera_applies_its_principal_point_and_refuses_lenses(tmp_path):
     path = tmp_path / "cameras.json"
     path.write_text(json.dumps([entry]))
     np.testing.assert_array_equal(load_cameras(path)[0].centre, [[3, 2]])
-    for change in ({"k1": 0.1}, {"is_fisheye": True}, {"camera_model": "OPENCV_FISHEYE"}, {"width": 0}, {"fx": -1}):
+    for change in ({"k5": 0.1}, {"latlong": True}, {"camera_model": "EQUIRECTANGULAR"}, {"width": 0}, {"fx": -1}):
         path.write_text(json.dumps([entry | change]))
         with pytest.raises(InputError, match=r"cameras\.json: \[0\]"):
             load_cameras(path)
@@ -174,13 +175,12 @@ def test_copied_validation_file_adds_no_views_and_a_trained_test_view_is_refused
         load_views(tmp_path)
 
 
-def test_mask_path_and_unknown_fields_are_warned_of(tmp_path):
-    frames = [frame("images/a.png", mask_path="masks/a.png"), frame("images/b.png", wobble=3)]
+def test_unknown_fields_are_warned_of(tmp_path):
+    frames = [frame("images/a.png"), frame("images/b.png", wobble=3)]
     folder = transforms(tmp_path, frames, ["images/a.png", "images/b.png"], tilt=2)
     with pytest.warns(UserWarning, match="not applied") as caught:
         load_views(folder)
     said = " ".join(str(warning.message) for warning in caught)
-    assert "mask_path of 1 of 2 frames is not applied" in said
     assert "'wobble'" in said
     assert "'tilt'" in said
 
@@ -241,7 +241,7 @@ def test_colmap_text_without_lines_of_points_holds_all_images(tmp_path):
         (pose(1, "a.png", "nan 0 0 0"), "1 PINHOLE 8 6 10 10 4 3\n", "NaN"),
         (pose(1, "a.png", "1e300 1e300 0 0"), "1 PINHOLE 8 6 10 10 4 3\n", "singular pose"),
         (pose(1, "a.png"), "1 PINHOLE 8 6 10 10 4 nan\n", "principal point"),
-        (pose(1, "a.png"), "1 SIMPLE_RADIAL_FISHEYE 8 6 10 4 3 0\n", "not known"),
+        (pose(1, "a.png"), "1 RAD_TAN_THIN_PRISM_FISHEYE 8 6 10 4 3 0\n", "not known"),
     ],
 )
 def test_colmap_entries_that_contradict_themselves_are_named(tmp_path, images, cameras, message):

@@ -182,6 +182,9 @@ def test_numbers_of_python_have_derivatives_too(x64):
 def test_integers_of_the_state_pass(x64):
     """A count in the state, by which a step goes."""
 
+    def counted(shared, state, number):
+        return begin(shared, state, state["count"])
+
     def counting(shared, state, between, number):
         after, own = end(shared, state, between, state["count"])
         return after | {"count": state["count"] + 1}, own

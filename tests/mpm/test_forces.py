@@ -198,8 +198,8 @@ def every_force(particles):
 
 def mixed():
     """Two bodies of two laws, in no order."""
-    sand = Material("drucker_prager", density=900.0, young=2e4, poisson=0.3, friction_angle=0.6)
-    particles, table = cube([(0.4, 0.75, 0.75), (1.1, 0.75, 0.75)], n=3, materials=(sand, RUBBER))
+    water = Material("fluid", density=900.0, bulk_modulus=2e4)
+    particles, table = cube([(0.4, 0.75, 0.75), (1.1, 0.75, 0.75)], n=3, materials=(water, RUBBER))
     order = np.random.default_rng(0).permutation(len(particles))
     return jax.tree.map(lambda rows: rows[order], particles), table
 
@@ -249,6 +249,7 @@ def test_gradients_are_central_differences(pulled):
         assert abs(expected) > 1e-9, path
 
 
+@pytest.mark.slow
 def test_forward_mode_agrees_with_reverse_mode(pulled):
     particles, table, forces, value, gradient, _ = pulled
     loss = loss_of(particles, table, differentiation="forward")
@@ -258,6 +259,7 @@ def test_forward_mode_agrees_with_reverse_mode(pulled):
     np.testing.assert_allclose(slope, sum(jnp.sum(leaf) for leaf in jax.tree.leaves(gradient)), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_two_devices_agree_with_one(pulled, two_devices):
     particles, table, forces, value, gradient, _ = pulled
     loss = loss_of(particles, table, devices=2)
@@ -301,30 +303,30 @@ def test_bodies_apart_and_implicit_steps_feel_forces(x64, apart):
 
 def test_a_sleeping_body_wakes_under_a_force_and_only_that(x64):
     particles, table = cube([(0.4, 0.75, 0.75), (1.4, 0.75, 0.75)])
-    blow = Impulse((0.0, 0.05, 0.0), weights=jnp.where(particles.body == 1, 1.0, 0.0), start=0.16)
+    blow = Impulse((0.0, 2.0, 0.0), weights=jnp.where(particles.body == 1, 1.0, 0.0), start=0.16)
     settings = SimConfig(substeps=10, devices=1)
     end, path, _ = rollout(
         particles, domain((22, 18, 18)), table, settings, frames=12, frame_dt=0.02, gravity=NONE, forces=(blow,),
         sleep=Sleep(frames=2),
     )  # fmt: skip
     momentum = np.asarray(end.mass[:, None] * end.v).reshape(2, -1, 3).sum(1)
-    np.testing.assert_allclose(momentum, [[0, 0, 0], [0, 0.05, 0]], atol=1e-9)
+    np.testing.assert_allclose(momentum, [[0, 0, 0], [0, 2, 0]], atol=1e-9)
     np.testing.assert_array_equal(path.x[-1][: len(particles) // 2], particles.x[: len(particles) // 2])
 
 
 def test_a_force_of_ones_own(x64):
-    class Swirl(Force):
+    class Surge(Force):
         rate: jax.Array
 
         def acceleration_of(self, x, v, time):
-            return self.rate * time * jnp.cross(jnp.asarray([0.0, 0.0, 1.0]), x - 0.75)
+            return self.rate * time * jnp.ones_like(x) - 3 * v
 
     particles, table = cube()
-    end, _, _ = run(particles, table, (Swirl(jnp.asarray(50.0)),), frames=1)
-    spin = np.asarray(particles.mass[:, None] * jnp.cross(particles.x - 0.75, end.v)).sum(0)
-    times = np.arange(10) * 0.002
-    inertia = np.asarray(particles.mass * ((particles.x - 0.75)[:, :2] ** 2).sum(-1)).sum()
-    np.testing.assert_allclose(spin, [0, 0, 50 * times.sum() * 0.002 * inertia], rtol=1e-3, atol=1e-9)
+    end, _, _ = run(particles, table, (Surge(jnp.asarray(5.0), start=0.01),), frames=1)
+    speed = 0.0
+    for k in range(5, 10):
+        speed += 0.002 * (5 * k * 0.002 - 3 * speed)
+    np.testing.assert_allclose(end.v, np.full(end.v.shape, speed), rtol=1e-9)
 
 
 def test_a_strong_force_asks_for_more_substeps():
@@ -349,7 +351,7 @@ def test_a_strong_force_asks_for_more_substeps():
 
 def test_wrong_forces_are_refused_by_name():
     particles, table = cube()
-    with pytest.raises(InputError, match=r"Wind\.drag = -1\.0: must be >= 0 1/s"):
+    with pytest.raises(InputError, match=r"Wind\.drag = -1\.0: must be 0 1/s or more"):
         Wind(NONE, -1.0)
     with pytest.raises(InputError, match=r"Spring\.end = 1\.0: it must not be before start = 2\.0 s"):
         Spring(NONE, 1.0, start=2.0, end=1.0)

@@ -14,7 +14,7 @@ from pigjax.cli import app
 from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io.finding import find_parts
 from pigjax.scene import load_scene, run_scene
-from pigjax.scene.draft import Part, _mark_supports, ground_height, up_of_cameras, up_of_ground
+from pigjax.scene.draft import Part, _mark_supports, find_direction, ground_height, up_of_ground
 from pigjax.scene.plan import make_plan, read_inputs, segment
 from pigjax.splat import Gaussians
 
@@ -47,22 +47,26 @@ def new(*words):
 
 
 def test_up_and_ground_of_a_cloud(cloud):
-    up, told = up_of_ground(cloud)
-    assert up == "-y"
+    up, told, is_sure = up_of_ground(cloud)
+    assert (up, is_sure) == ("-y", True)
     assert "in one layer" in told
     assert ground_height(cloud, np.array([0.0, -1.0, 0.0])) == pytest.approx(-0.1, abs=0.02)
     ball = sphere(np.zeros(3), 1.0, 4000, np.random.default_rng(1))
-    assert up_of_ground(ball)[0] == "z"
-    assert "a guess" in up_of_ground(ball)[1]
+    assert not up_of_ground(ball)[2]
     assert ground_height(ball, np.array([0.0, 0.0, 1.0])) is None
-    mushroom = np.concatenate([0.5 * sphere(np.zeros(3), 1.0, 3000, np.random.default_rng(2)) * [1, 1, 0.01], ball])
-    assert up_of_ground(mushroom + np.where(np.arange(7000) < 3000, -2, 0)[:, None] * [0, 0, 1])[0] == "z"
-    assert ground_height(mushroom + np.where(np.arange(7000) < 3000, -2, 0)[:, None] * [0, 0, 1], np.eye(3)[2]) is None
+    foot = 0.5 * sphere(np.zeros(3), 1.0, 3000, np.random.default_rng(2)) * [1, 1, 0.01] - [0, 0, 2]
+    mushroom = np.concatenate([foot, ball])
+    assert up_of_ground(mushroom)[0] == "z"
+    assert ground_height(mushroom, np.array([0.0, 0.0, 1.0])) is None  # narrower than what stands on it
 
 
-def test_up_of_cameras_is_their_own():
+def test_up_of_a_tilted_capture_is_a_direction(cloud):
     cameras = io.load_cameras(TABLETOP)[0]
-    assert up_of_cameras(cameras)[0] == "z"
+    np.testing.assert_allclose(find_direction(cameras, cloud)[0] @ [0, 0, 1], 1, atol=1e-3)
+    tilt = np.array([[1, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]])
+    up, told = find_direction(None, cloud[:-40] @ tilt.T)
+    np.testing.assert_allclose(up, tilt @ [0, -1, 0], atol=0.02)
+    assert "from the ground" in told
 
 
 def test_what_carries_the_others_is_fixed():
@@ -71,14 +75,14 @@ def test_what_carries_the_others_is_fixed():
 
     slab = part("thing", [-1, -1, -0.1], [1, 1, 0])
     cups = [part(f"cup_{k}", [k / 2 - 0.1, 0, 0.0], [k / 2 + 0.1, 0.2, 0.3]) for k in (-1, 0, 1)]
-    _mark_supports([slab, *cups], np.array([0.0, 0.0, 1.0]))
+    _mark_supports([slab, *cups])
     assert slab.fixed
     assert not any(cup.fixed for cup in cups)
     plant, pot = part("leaves", [0, 0, 1], [1, 1, 2]), part("flower_pot", [0, 0, 0], [1, 1, 1])
-    _mark_supports([plant, pot], np.array([0.0, 0.0, 1.0]))
+    _mark_supports([plant, pot])
     assert (plant.fixed, pot.fixed) == (False, True)
     alone = part("table", [0, 0, 0], [1, 1, 1])
-    _mark_supports([alone], np.array([0.0, 0.0, 1.0]))
+    _mark_supports([alone])
     assert not alone.fixed
 
 
@@ -87,16 +91,19 @@ def test_a_bare_file_becomes_a_scene_that_plans(cloud, tmp_path):
     told = new(tmp_path / "my things.ply", "-o", tmp_path / "scene")
     assert told.exit_code == 0, told.output
     scene = load_scene(tmp_path / "scene" / "scene.toml")
-    assert scene.input.up == "-y"
+    assert scene.world.up == "-y"
     assert sorted(scene.objects) == ["part_1", "part_2"]
-    np.testing.assert_allclose(scene.planes["ground"].point, [0, 0.1, 0], atol=0.02)
+    np.testing.assert_allclose(scene.world.origin[1], 0.1, atol=0.02)
+    assert scene.planes["ground"].point == (0.0, 0.0, 0.0)
     inputs = read_inputs(scene)
     labels = segment(scene, inputs)
     found = np.asarray(labels.object_id)
     assert (np.bincount(found)[1:] == [900, 500]).all()
     plan = make_plan(scene, inputs, labels)
     assert set(np.asarray(plan.particles.body)) == {0, 1}
-    assert np.isfinite(np.asarray(plan.particles.x)).all()
+    x = np.asarray(plan.particles.x)
+    assert np.isfinite(x).all()
+    assert 0.1 < x[:, 2].min() < 0.2  # of the ball whose foot is 13 cm above the ground
     thumbnail = np.asarray(Image.open(tmp_path / "scene" / "thumbnails" / "part_1.png").convert("L"))
     assert 0.1 < (thumbnail < 250).mean() < 0.8
     again = new(tmp_path / "my things.ply", "-o", tmp_path / "scene")
@@ -108,8 +115,9 @@ def test_a_single_thing_is_one_object(tmp_path):
     io.save_ply(tmp_path / "ball.ply", splats(sphere(np.zeros(3), 0.3, 600, np.random.default_rng(2))))
     assert new(tmp_path / "ball.ply", "-o", tmp_path / "scene", "--up", "y").exit_code == 0
     scene = load_scene(tmp_path / "scene" / "scene.toml")
-    assert (list(scene.objects), scene.input.labels, scene.input.up) == (["part_1"], None, "y")
-    assert scene.planes["ground"].point[1] == pytest.approx(-0.3, abs=0.02)
+    assert (list(scene.objects), scene.input.labels, scene.world.up) == (["part_1"], None, "y")
+    assert scene.world.origin[1] == pytest.approx(-0.3, abs=0.02)
+    assert scene.planes["ground"].point[2] == 0
 
 
 def test_what_is_missing_is_said_with_commands(tmp_path):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import gallery
 from pigjax import io
 from pigjax.mpm.materials import PRESETS
 from pigjax.scene import load_scene
@@ -31,3 +32,25 @@ def test_scene_shows_its_preset_on_objects_that_exist(name):
 @pytest.mark.parametrize("name", sorted(SCENES))
 def test_readme_of_the_gallery_has_its_row(name):
     assert re.search(rf"^\| \[{name}\]\({name}\.toml\) \|", (FOLDER / "README.md").read_text(), re.M)
+
+
+CAPABILITIES = {path.stem: path for path in (FOLDER.parent / "gallery").glob("*.toml")}
+
+
+@pytest.mark.parametrize("name", sorted(CAPABILITIES))
+def test_scene_of_a_capability_loads_and_says_where_its_data_are(name):
+    """What the repository carries is there with the objects that it names; the rest is told and would be skipped."""
+    scene, path = load_scene(CAPABILITIES[name]), CAPABILITIES[name]
+    missing = [part for part in gallery.parts_of(path) if not gallery.located(path, part, None).is_file()]
+    assert bool(missing) == bool(gallery.data_of(path)), missing
+    if not missing:
+        assert set(scene.objects) <= set(io.read_json(scene.path(scene.input.names)).values())
+    readme = (path.parent / "README.md").read_text()
+    assert re.search(rf"^\| \[{name}\]\({name}\.toml\) \|", readme, re.M)
+
+
+def test_data_beside_the_scene_or_in_a_folder_are_found(tmp_path):
+    path = CAPABILITIES["plant"]
+    assert gallery.located(path, "plant.ply", tmp_path) == tmp_path / "plant.ply"
+    assert gallery.told(path)[0].startswith("A houseplant sways")
+    assert "Marcel Padilla" in gallery.data_of(path)

@@ -37,7 +37,7 @@ BAD = {
     "unknown section": (values(simulatoin={}), r"simulatoin: unknown field; did you mean 'simulation'"),
     "unknown object field": (values(objects__ball={"material": "jelly", "yung": 1.0}), r"objects\.ball\.yung.*'young'"),
     "wrong type": (values(simulation__dx="fine"), r"simulation\.dx = 'fine': it must be a number"),
-    "missing field": (values(simulation={"frames": 3}), r"simulation\.dx is missing: give a number"),
+    "missing field": (values(input={}), r"input\.gaussians is missing: give a text"),
     "not positive": (values(simulation__dx=-1.0), r"simulation\.dx = -1\.0: it must be > 0"),
     "unknown preset": (
         values(objects__ball={"material": "jely"}),

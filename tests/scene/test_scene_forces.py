@@ -20,7 +20,7 @@ BAD = {
     "kind of a list": ({**WIND, "kind": ["wind"]}, r"forces\.push\.kind = \['wind'\]: "),
     "unknown field": ({**WIND, "darg": 1.0}, r"forces\.push\.darg: unknown field; did you mean 'drag'"),
     "no velocity": ({"kind": "wind"}, r"forces\.push\.velocity is missing: give 3 numbers in"),
-    "negative drag": ({**WIND, "drag": -1.0}, r"forces\.push\.drag = -1\.0: it must be >= 0 1/s"),
+    "negative drag": ({**WIND, "drag": -1.0}, r"forces\.push\.drag = -1\.0: it must be 0 1/s or more"),
     "end before start": ({**WIND, "start": 2.0, "end": 1.0}, r"forces\.push\.end = 1\.0: it must not be before start"),
     "empty field": ({"kind": "field"}, r"forces\.push\.acceleration = \(0\.0, 0\.0, 0\.0\): give it, or a gradient"),
     "unknown object": (

@@ -15,13 +15,13 @@ from splats import dense, gaussians_of, make_scene
 import pigjax.splat as splat_module
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
+from pigjax.core.harmonics import sh_basis
 from pigjax.core.linalg import quat_to_matrix
 from pigjax.splat import Gaussians, RenderConfig, Splats, render, required_capacity, surface_depth
 from pigjax.splatting import reference
 from pigjax.splatting.alpha import blend_chunk, running_sums, transmittances
 from pigjax.splatting.binning import Boxes, bin_splats, blend_config, count_pairs, list_pass, pairs_in_open_tiles
 from pigjax.splatting.projection import project_splats
-from pigjax.splatting.sh import sh_basis
 from pigjax.splatting.types import OUTPUTS, as_splats
 
 EXACT = RenderConfig(alpha_min=1e-7, transmittance_min=0.0)

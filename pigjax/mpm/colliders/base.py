@@ -202,14 +202,23 @@ class Collider(eqx.Module):
 
     def _to_shape(self, points: Points, time: Time) -> Points:
         """The same points of the body where the shape's own numbers describe it."""
-        turn = self.rotation
-        if self.angular_velocity is not None:
-            turned = _quat_of_spin(self.angular_velocity * (self.elapsed + time))
-            turn = turned if turn is None else quat_multiply(turned, turn)
-        if turn is not None:
+        if (turn := self._turn_at(time)) is not None:
             from_pivot = points - self._pivot_at(time)
             return self._pivot + (from_pivot[..., :, None] * quat_to_matrix(turn)).sum(-2)
         return points if self.velocity is None else points - self.velocity * (self.elapsed + time)
+
+    def _turn_at(self, time: Time) -> Float[Array, "4"] | None:
+        if self.angular_velocity is None:
+            return self.rotation
+        turned = _quat_of_spin(self.angular_velocity * (self.elapsed + time))
+        return turned if self.rotation is None else quat_multiply(turned, self.rotation)
+
+    def placed(self, points: Points, time: Time = 0.0) -> Points:
+        """Points [m] of the body, where the shape's own numbers describe it, as they lie a time [s] from now."""
+        if (turn := self._turn_at(time)) is not None:
+            from_pivot = points - self._pivot
+            return self._pivot_at(time) + (from_pivot[..., None, :] * quat_to_matrix(turn)).sum(-1)
+        return points if self.velocity is None else points + self.velocity * (self.elapsed + time)
 
     def _own_velocity(self, points: Points, time: Time) -> Float[Array, "*#n 3"] | None:
         if self.angular_velocity is None:

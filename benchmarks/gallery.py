@@ -1,0 +1,91 @@
+"""The gallery: a scene of examples/gallery for each capability, with its time and memory.
+
+Each scene runs in a process of its own and leaves its results as `pigjax run` does in `--out`/NAME. Scenes on data that
+the repository does not carry look for it in `--data`, and are skipped with a line that says where a user gets it.
+"""
+
+import os
+import re
+from pathlib import Path
+
+import imageio.v3 as iio
+
+from benchmarks.common.command import start_worker
+from benchmarks.common.pages import EXAMPLES, ROOT, head, row
+from benchmarks.common.timing import clock, peak_memory
+from benchmarks.media import write_sheet
+from pigjax.io import read_toml
+from pigjax.scene import run_scene, scene_from
+
+SCENES = {path.stem: path for path in sorted((EXAMPLES / "gallery").glob("*.toml"))}
+FILES = ("gaussians", "views", "labels", "names")  # entries of a scene's `input`
+HEADER = head("scene", "shows", "s", "GB", "particles", "frames", "substeps", "least J", "notes")
+
+
+def gallery(options) -> None:
+    """Run the scenes, and draw the sheet of those that have a clip."""
+    print(HEADER)
+    for name in options.scenes:
+        path = SCENES[name]
+        if missing := [part for part in parts_of(path) if not located(path, part, options.data).is_file()]:
+            print(row(name, told(path)[0], *[""] * 6, f"skipped: no {missing[0]}; {data_of(path)}"))
+            continue
+        child = start_worker("gallery", name, options.out, options.data or "", options.accuracy)
+        said, _ = child.communicate()
+        lines = said.strip().splitlines()
+        print(lines[-1] if child.returncode == 0 and lines else row(name, told(path)[0], *[""] * 6, "failed"))
+    clips = {name: options.out / name / "video.mp4" for name in SCENES}
+    there = {name: iio.imread(clip) for name, clip in clips.items() if clip.is_file()}
+    if there:
+        write_sheet(there, options.media / "gallery.png")
+
+
+def worker(name: str, out: str, data: str, accuracy: str) -> None:
+    """Run one scene, and print its line of the table."""
+    path = SCENES[name]
+    values = read_toml(path)
+    for key, part in values["input"].items():
+        if key in FILES:
+            place = located(path, part, Path(data) if data else None)
+            values["input"][key] = os.path.relpath(place, path.parent)
+    scene = scene_from(values, folder=path.parent, where=name, accuracy=accuracy)
+    seconds, report = clock(lambda: run_scene(scene, Path(out) / name))
+    sizes = [report.sizes[key] for key in ("particles", "frames", "substeps_per_frame")]
+    least = f"{report.health['min_J']:.3f}" if "min_J" in report.health else ""
+    notes = "; ".join(report.warnings).replace("\n", " ")
+    print(row(name, told(path)[0], f"{seconds:.0f}", f"{peak_memory():.1f}", *sizes, least, notes))
+
+
+def parts_of(path: Path) -> list[str]:
+    """Files that a scene reads."""
+    given = read_toml(path)["input"]
+    return [given[key] for key in FILES if key in given]
+
+
+def located(path: Path, part: str, data: Path | None) -> Path:
+    """Where a file of a scene is: beside the scene, or in the folder of the user's data."""
+    beside = path.parent / part
+    return beside if beside.exists() or data is None else data / part
+
+
+def told(path: Path) -> tuple[str, str]:
+    """The first sentence of a scene's file, and where its data come from."""
+    lines = [line.removeprefix("#").strip() for line in path.read_text().splitlines() if line.startswith("#")]
+    text = " ".join(lines)
+    first, _, source = text.partition("data: ")
+    return first.strip().rstrip("."), source
+
+
+def data_of(path: Path) -> str:
+    """Where a user gets the data of a scene."""
+    return re.sub(r"\s+", " ", told(path)[1])
+
+
+PARTS = {"gallery": ("Gallery", gallery)}
+OPTIONS = {
+    "scenes": {"nargs": "+", "default": list(SCENES), "choices": SCENES, "help": "some of them"},
+    "data": {"type": Path, "default": None, "help": "folder of data that the repository does not carry"},
+    "accuracy": {"default": "standard", "choices": ("draft", "standard", "reference"), "help": "of the scenes"},
+    "out": {"type": Path, "default": ROOT / "out" / "gallery", "help": "folder of all results"},
+}
+DEVICES = None

@@ -1,0 +1,181 @@
+"""The backend of kernels: XLA everywhere, or hand-written Warp kernels (extra `gpu`) on CUDA devices and CPUs. Leaf.
+
+Warp is imported when a simulation or a drawing first takes it, and never before.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.metadata
+import importlib.util
+import os
+import sys
+from typing import Any
+
+import jax
+
+from pigjax.core.errors import InputError
+
+BACKENDS = ("auto", "xla", "warp")
+_LEAST = (1, 16)  # of warp-lang: from it on, its kernels run under JAX on CPUs too
+_ORDERED = ("--xla_gpu_deterministic_ops", "--xla_gpu_exclude_nondeterministic_ops")
+_REMEDY = "pip install 'pigjax[gpu]'"
+
+
+def check_backend(name: str, choice: str, differentiation: str) -> None:
+    """Refuse a choice of backend that cannot be served.
+
+    Args:
+        name: of the class that has the field, for the message.
+        choice: "auto", "xla" or "warp".
+        differentiation: "reverse" or "forward".
+
+    Raises:
+        InputError: Warp is asked for, and it is not installed or forward mode is asked for too.
+    """
+    if choice != "warp":
+        return
+    if differentiation == "forward":
+        raise InputError(
+            f"{name}.backend = 'warp' with differentiation = 'forward': Warp kernels have reverse mode only; take"
+            ' backend = "xla" or "auto".'
+        )
+    fault = _fault_of_installation()
+    if fault is not None:
+        raise InputError(f"{name}.backend = 'warp': {fault}.")
+
+
+def takes_warp(choice: str, differentiation: str) -> bool:
+    """Whether a computation on JAX's default device runs on Warp kernels.
+
+    Args:
+        choice: "auto" takes Warp on CUDA devices where it is installed and finds the driver; "xla" never; "warp"
+            always.
+        differentiation: "forward" always takes XLA.
+
+    Raises:
+        InputError: Warp is asked for on a device that it has no kernels for.
+    """
+    if choice == "xla" or differentiation == "forward":
+        return False
+    if choice == "auto":
+        return _reason_for_xla() is None
+    if not _is_cuda() and jax.default_backend() != "cpu":
+        raise InputError(
+            f"backend = 'warp' on a device of kind {jax.default_backend()}: Warp has kernels for CUDA devices and CPUs;"
+            ' take backend = "xla" or "auto".'
+        )
+    return True
+
+
+def check_order(warp: bool) -> None:
+    """Refuse sums in a fixed order where XLA adds in any.
+
+    Args:
+        warp: whether the sums are Warp kernels, which have a fixed order if asked for.
+
+    Raises:
+        InputError: XLA scatters by atomics on the default device.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if not warp and jax.default_backend() == "gpu" and not any(flag in flags for flag in _ORDERED):
+        raise InputError(
+            "SimConfig.deterministic = True: XLA adds in any order on a GPU; take backend = 'warp', or set"
+            f" XLA_FLAGS={_ORDERED[0]}=true before JAX starts."
+        )
+
+
+def backend_in_use() -> str:
+    """One line on the backend that "auto" takes on this machine, and why."""
+    device = f"{jax.local_device_count()} x {jax.devices()[0].device_kind}"
+    reason = _reason_for_xla()
+    if reason is None:
+        return f"warp {importlib.metadata.version('warp-lang')} on {device}"
+    return f"xla on {device} ({reason})"
+
+
+def import_warp() -> Any:
+    """The package `warp`, silent but for warnings unless the user has imported it before.
+
+    Raises:
+        InputError: it is not installed, or too old.
+    """
+    fault = _fault_of_installation()
+    if fault is not None:
+        raise InputError(f"backend = 'warp': {fault}.")
+    ours = "warp" not in sys.modules
+    import warp
+
+    if ours:
+        warp.config.log_level = warp.LOG_WARNING
+    return warp
+
+
+def launcher(kernel: Any, name: str, outputs: int, in_out: tuple[str, ...] = ()) -> Any:
+    """A Warp kernel as a function of JAX arrays, launched on the axes of its first array.
+
+    The name must tell the variants of a kernel apart, and launches must not differ in numbers that are no arrays: JAX
+    keeps compiled programs on disk under a key that has the name and the shapes only. Warp numbers the calls of a
+    kernel in each process; the number is held at 0, so that the key does not depend on what was traced before.
+
+    Args:
+        kernel: of `wp.kernel`.
+        name: unique in the package.
+        outputs: number of its last arguments that are results, `in_out` included.
+        in_out: names of arguments that are read and written in place.
+    """
+    warp = import_warp()
+    kernel.func.__qualname__ = f"pigjax_{name}"
+    call = warp.jax_kernel(kernel, num_outputs=outputs, in_out_argnames=list(in_out))
+
+    def launch(*arrays: Any, **sizes: Any) -> Any:
+        call.launch_id = 0
+        return call(*arrays, **sizes)
+
+    launch.kernel = kernel  # type: ignore[attr-defined]
+    return launch
+
+
+def caller(function: Any, name: str, outputs: int, in_out: tuple[str, ...] = ()) -> Any:
+    """A function of Warp arrays, which launches on the host, as a function of JAX arrays; as `launcher` otherwise."""
+    warp = import_warp()
+    function.__qualname__ = f"pigjax_{name}"
+    mode = warp.JaxCallableGraphMode.NONE
+    call = warp.jax_callable(function, num_outputs=outputs, graph_mode=mode, in_out_argnames=list(in_out))
+
+    def run(*arrays: Any, **sizes: Any) -> Any:
+        call.call_id = 0
+        return call(*arrays, **sizes)
+
+    return run
+
+
+def _fault_of_installation() -> str | None:
+    """What is missing to import Warp; None: nothing."""
+    if importlib.util.find_spec("warp") is None:
+        return f"it needs warp-lang: {_REMEDY}"
+    try:
+        version = importlib.metadata.version("warp-lang")
+    except importlib.metadata.PackageNotFoundError:
+        return f"the package 'warp' that is installed is not NVIDIA's: {_REMEDY}"
+    if tuple(int(part) for part in version.split(".")[:2]) < _LEAST:
+        return f"it needs warp-lang {'.'.join(map(str, _LEAST))} or newer, found {version}: {_REMEDY}"
+    return None
+
+
+def _reason_for_xla() -> str | None:
+    """Why "auto" takes XLA; None: it takes Warp."""
+    if not _is_cuda():
+        return "Warp is taken on CUDA devices only, unless asked for"
+    return _fault_of_installation() or _fault_of_driver()
+
+
+@functools.cache
+def _fault_of_driver() -> str | None:
+    return None if import_warp().is_cuda_available() else "Warp found no CUDA driver that it can use"
+
+
+def _is_cuda() -> bool:
+    """Whether JAX's default device is one of NVIDIA's; AMD's are of platform "gpu" too."""
+    device = jax.devices()[0]
+    return device.platform == "gpu" and "cuda" in device.client.platform_version.lower()

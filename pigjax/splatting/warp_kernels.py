@@ -1,0 +1,328 @@
+# mypy: ignore-errors
+# ruff: noqa: RUF046, UP018
+"""Warp kernels of the rasterizer: slots of the lists of tiles, their sort, blending, its adjoint, and credits.
+
+One thread a pixel and one block of 256 a tile of 16 x 16; every thread of a tile walks the list of its tile. The
+gradient of a splat is summed over a warp by shuffles before the atomics. Every array has a leading axis of images, so
+that many cameras are one launch. As in `mpm.warp_kernels`, a launch takes its sizes from the shapes of its arrays.
+
+Kernels are in Warp's language: annotations are calls, and int(0) declares a variable where 0 is a constant.
+"""
+
+import functools
+from typing import Any, NamedTuple, no_type_check
+
+import jax
+
+from pigjax.core.backend import caller, import_warp, launcher
+
+QUADS = 2  # of a splat's row before its channels: x, y, conic xx, xy; conic yy, log opacity, depth, 0
+
+
+class BlendKernels(NamedTuple):
+    """The kernels of a number of channels and a precision, as functions of JAX arrays that begin with an axis."""
+
+    forward: Any  # (transmittance, planes, surface, rows, rank, start, limits, sizes) -> the first three, blended on
+    # (transmittance, prefix, rows' cotangent, total, planes' and surface's cotangents, rows, rank, start, limits,
+    # sizes) -> the first three
+    adjoint: Any
+
+
+class ListKernels(NamedTuple):
+    """The kernels that need no channels."""
+
+    # (tile, rank, shapes, low, size, end, before, open, limits, sizes) -> the first two, in twice as many slots
+    slots: Any
+    # (credits, rows, rank, start, candidates, ids, limits, sizes) -> credits; the pixels are those of ids
+    credit: Any
+
+
+# Whole warps belong to one tile where a tile's pixels fill them; else lanes of several tiles must not be summed.
+_ANY = """
+#if defined(__CUDA_ARCH__)
+    return whole == 0 ? flag : (__any_sync(0xffffffffu, flag) != 0 ? 1 : 0);
+#else
+    return flag;
+#endif
+"""
+_ADD = """
+#if defined(__CUDA_ARCH__)
+    SCALAR v[4] = {value[0], value[1], value[2], value[3]};
+    if (whole) {
+        for (int k = 0; k < 4; ++k)
+            for (int o = 16; o > 0; o /= 2) v[k] += __shfl_xor_sync(0xffffffffu, v[k], o);
+        if ((threadIdx.x & 31) != 0) return;
+    }
+    SCALAR* to = (SCALAR*)(&sums.data[at]);
+#if FLOAT && __CUDA_ARCH__ >= 900
+    atomicAdd((float4*)to, make_float4(v[0], v[1], v[2], v[3]));
+#else
+    for (int k = 0; k < 4; ++k) atomicAdd(to + k, v[k]);
+#endif
+#else
+    sums.data[at] = sums.data[at] + value;
+#endif
+"""
+_READ = """
+#if defined(__CUDA_ARCH__) && FLOAT
+    float4 four = *(const float4*)(&rows.data[at]);
+    return wp::vec_t<4, float>(four.x, four.y, four.z, four.w);
+#else
+    return rows.data[at];
+#endif
+"""
+
+
+@no_type_check
+def _tools(wp: Any, single: bool) -> Any:
+    """Types, and the functions that several kernels call."""
+    real = wp.float32 if single else wp.float64
+    vec2, vec4 = (wp.types.vector(length=k, dtype=real) for k in (2, 4))
+
+    def text(snippet):
+        return snippet.replace("SCALAR", "float" if single else "double").replace("FLOAT", str(int(single)))
+
+    @wp.func_native(_ANY)
+    def any_of_warp(flag: int, whole: int) -> int: ...
+
+    @wp.func_native(text(_ADD))
+    def add(sums: wp.array3d(dtype=vec4), at: int, value: vec4, whole: int): ...
+
+    @wp.func_native(text(_READ))
+    def read(rows: wp.array3d(dtype=vec4), at: int) -> vec4: ...
+
+    @wp.func
+    def pixel_centre(tile: int, pixel: int, columns: int, edge: int):
+        x = real(tile % columns * edge + pixel % edge) + real(0.5)
+        y = real(tile // columns * edge + pixel // edge) + real(0.5)
+        return vec2(x, y)
+
+    @wp.func
+    def opacity(first: vec4, second: vec4, u: real, v: real):
+        """Alpha before its clamp, at an offset from the centre."""
+        fall = real(0.5) * (first[2] * u * u + second[0] * v * v) + first[3] * u * v
+        return wp.exp(second[1] - fall)
+
+    # unrolled loops take long to compile; a CPU gains little from them
+    unrolled = {"max_unroll": 1 if jax.default_backend() == "cpu" else 16}
+    kernel = functools.partial(wp.kernel, module="unique", enable_backward=False, module_options=unrolled)
+    return kernel, real, vec4, any_of_warp, add, read, pixel_centre, opacity
+
+
+@functools.cache
+@no_type_check  # Warp reads the annotations and the text of kernels
+def blend_kernels(channels: int, single: bool) -> BlendKernels:
+    """Kernels that blend `channels` groups of four channels at once, in single or double precision.
+
+    Args:
+        channels: groups of four; their sums stay in registers.
+        single: float32, else float64.
+    """
+    wp = import_warp()
+    kernel, real, vec4, any_of_warp, add, read, pixel_centre, opacity = _tools(wp, single)
+    sums_of = wp.types.matrix(shape=(channels, 4), dtype=real)
+    width = channels + QUADS
+
+    @kernel
+    def blend(
+        transmittance: wp.array3d(dtype=real), planes: wp.array4d(dtype=vec4), surface: wp.array3d(dtype=real),
+        rows: wp.array3d(dtype=vec4), rank: wp.array2d(dtype=wp.int32), start: wp.array2d(dtype=wp.int32),
+        limits: wp.array1d(dtype=vec4), sizes: wp.array2d(dtype=wp.int32),
+    ):  # fmt: skip
+        b, tile, pixel = wp.tid()
+        alpha_min, alpha_max, least, tau = limits[b][0], limits[b][1], limits[b][2], limits[b][3]
+        at = pixel_centre(tile, pixel, sizes[b, 0], sizes[b, 1])
+        through, picked = real(transmittance[b, tile, pixel]), real(surface[b, tile, pixel])
+        total = sums_of()
+        for q in range(wp.static(channels)):
+            total[q] = planes[b, tile, q, pixel]
+        for s in range(start[b, tile], start[b, tile + 1]):
+            if through <= least:
+                break
+            row = (b * rows.shape[1] + rank[b, s]) * wp.static(width)
+            first, second = read(rows, row), read(rows, row + 1)
+            alpha = wp.min(opacity(first, second, at[0] - first[0], at[1] - first[1]), alpha_max)
+            if alpha >= alpha_min:
+                weight = alpha * through
+                if through - weight > least:
+                    for q in range(wp.static(channels)):
+                        total[q] = total[q] + weight * read(rows, row + wp.static(QUADS) + q)
+                after = through * (real(1.0) - alpha)
+                if through >= tau and after < tau:
+                    picked += second[2]
+                through = after
+        transmittance[b, tile, pixel] = through
+        surface[b, tile, pixel] = picked
+        for q in range(wp.static(channels)):
+            planes[b, tile, q, pixel] = total[q]
+
+    @kernel
+    def blend_adjoint(
+        transmittance: wp.array3d(dtype=real), prefix: wp.array3d(dtype=real), of_rows: wp.array3d(dtype=vec4),
+        total: wp.array3d(dtype=real), of_planes: wp.array4d(dtype=vec4), of_surface: wp.array3d(dtype=real),
+        rows: wp.array3d(dtype=vec4), rank: wp.array2d(dtype=wp.int32), start: wp.array2d(dtype=wp.int32),
+        limits: wp.array1d(dtype=vec4), sizes: wp.array2d(dtype=wp.int32),
+    ):  # fmt: skip
+        b, tile, pixel = wp.tid()
+        alpha_min, alpha_max, least, tau = limits[b][0], limits[b][1], limits[b][2], limits[b][3]
+        at, whole = pixel_centre(tile, pixel, sizes[b, 0], sizes[b, 1]), int(0)
+        if transmittance.shape[2] % 32 == 0:
+            whole = 1
+        through, passed = real(transmittance[b, tile, pixel]), real(prefix[b, tile, pixel])
+        sum_ = total[b, tile, pixel]
+        cotangent = sums_of()
+        for q in range(wp.static(channels)):
+            cotangent[q] = of_planes[b, tile, q, pixel]
+        for s in range(start[b, tile], start[b, tile + 1]):
+            is_open = int(0)
+            if through > least:
+                is_open = 1
+            if any_of_warp(is_open, whole) == 0:
+                break
+            row = (b * rows.shape[1] + rank[b, s]) * wp.static(width)
+            first, second = read(rows, row), read(rows, row + 1)
+            u, v = at[0] - first[0], at[1] - first[1]
+            unclamped = opacity(first, second, u, v)
+            alpha = wp.min(unclamped, alpha_max)
+            weight, slope, pick, seen = real(0.0), real(0.0), real(0.0), int(0)
+            if is_open == 1 and alpha >= alpha_min:
+                after = through * (real(1.0) - alpha)
+                if through >= tau and after < tau:
+                    pick = of_surface[b, tile, pixel]
+                    seen = 1
+                if through - alpha * through > least:
+                    weight = alpha * through
+                    seen = 1
+                    gain = real(0.0)
+                    for q in range(wp.static(channels)):
+                        gain += wp.dot(cotangent[q], read(rows, row + wp.static(QUADS) + q))
+                    passed += weight * gain
+                    if unclamped < alpha_max:
+                        slope = weight * gain - (sum_ - passed) * (alpha / (real(1.0) - alpha))
+                through = after
+            if any_of_warp(seen, whole) == 1:
+                a, half, c = first[2], real(0.5) * slope, second[0]
+                by_place = vec4(
+                    slope * (a * u + first[3] * v), slope * (c * v + first[3] * u), -half * u * u, -slope * u * v
+                )
+                add(of_rows, row, by_place, whole)
+                add(of_rows, row + 1, vec4(-half * v * v, slope, pick, real(0.0)), whole)
+                for q in range(wp.static(channels)):
+                    add(of_rows, row + wp.static(QUADS) + q, weight * cotangent[q], whole)
+        transmittance[b, tile, pixel] = through
+        prefix[b, tile, pixel] = passed
+
+    name = f"{channels}_{'float' if single else 'double'}"
+    return BlendKernels(
+        launcher(blend, f"blend_{name}", 3, ("transmittance", "planes", "surface")),
+        launcher(blend_adjoint, f"blend_adjoint_{name}", 3, ("transmittance", "prefix", "of_rows")),
+    )
+
+
+@functools.cache
+@no_type_check
+def list_kernels(single: bool) -> ListKernels:
+    """Kernels that write the slots of lists and sum credits, in single or double precision."""
+    wp = import_warp()
+    kernel, real, vec4, _, _, read, pixel_centre, opacity = _tools(wp, single)
+    pair = wp.vec2i
+
+    @wp.func
+    def fall(a: real, b: real, c: real, u: real, v: real):
+        return real(0.5) * (a * u * u + c * v * v) + b * u * v
+
+    @kernel
+    def list_slots(
+        tile: wp.array2d(dtype=wp.int32), rank: wp.array2d(dtype=wp.int32), shapes: wp.array3d(dtype=real),
+        low: wp.array2d(dtype=pair), size: wp.array2d(dtype=pair), end: wp.array2d(dtype=wp.int32),
+        before: wp.array2d(dtype=wp.int32), open_: wp.array2d(dtype=wp.int32), limits: wp.array1d(dtype=vec4),
+        sizes: wp.array2d(dtype=wp.int32),
+    ):  # fmt: skip
+        b, slot = wp.tid()
+        count, columns, edge = shapes.shape[1], sizes[b, 0], sizes[b, 1]
+        found, owner = open_.shape[1], int(0)  # a tile beyond the last owns what is not kept
+        if slot < tile.shape[1] // 2 and slot < end[b, count - 1]:
+            left, right = int(0), count - 1  # the first splat whose pairs end beyond this slot
+            while left < right:
+                middle = (left + right) // 2
+                if end[b, middle] > slot:
+                    right = middle
+                else:
+                    left = middle + 1
+            owner = left
+            within, across = slot - before[b, owner], wp.max(size[b, owner][0], 1)
+            column = low[b, owner][0] + within % across
+            row = low[b, owner][1] + within // across
+            here = wp.clamp(row * columns + column, 0, open_.shape[1] - 1)
+            a, c_xy, c = shapes[b, owner, 2], shapes[b, owner, 3], shapes[b, owner, 4]
+            x0 = real(column * edge) + real(0.5) - shapes[b, owner, 0]
+            y0 = real(row * edge) + real(0.5) - shapes[b, owner, 1]
+            x1, y1 = x0 + real(edge - 1), y0 + real(edge - 1)
+            lowest = real(0.0)
+            if x0 > real(0.0) or x1 < real(0.0) or y0 > real(0.0) or y1 < real(0.0):
+                lowest = wp.min(
+                    wp.min(
+                        fall(a, c_xy, c, x0, wp.clamp(-c_xy * x0 / c, y0, y1)),
+                        fall(a, c_xy, c, x1, wp.clamp(-c_xy * x1 / c, y0, y1)),
+                    ),
+                    wp.min(
+                        fall(a, c_xy, c, wp.clamp(-c_xy * y0 / a, x0, x1), y0),
+                        fall(a, c_xy, c, wp.clamp(-c_xy * y1 / a, x0, x1), y1),
+                    ),
+                )
+            if open_[b, here] != 0 and shapes[b, owner, 5] - lowest >= limits[b][0]:
+                found = here
+        tile[b, slot] = found
+        rank[b, slot] = owner
+
+    @kernel
+    def credit(
+        ids: wp.array3d(dtype=wp.int32), credits_: wp.array3d(dtype=real), rows: wp.array3d(dtype=vec4),
+        rank: wp.array2d(dtype=wp.int32), start: wp.array2d(dtype=wp.int32), candidates: wp.array3d(dtype=wp.int32),
+        limits: wp.array1d(dtype=vec4), sizes: wp.array2d(dtype=wp.int32),
+        transmittance: wp.array3d(dtype=real),
+    ):  # fmt: skip
+        b, tile, pixel = wp.tid()
+        at = pixel_centre(tile, pixel, sizes[b, 0], sizes[b, 1])
+        through, own = real(1.0), ids[b, tile, pixel]
+        for s in range(start[b, tile], start[b, tile + 1]):
+            if through <= limits[b][2]:
+                break
+            splat = rank[b, s]
+            row = (b * rows.shape[1] + splat) * wp.static(QUADS)
+            first, second = read(rows, row), read(rows, row + 1)
+            alpha = wp.min(opacity(first, second, at[0] - first[0], at[1] - first[1]), limits[b][1])
+            if alpha >= limits[b][0]:
+                weight = alpha * through
+                if through - weight > limits[b][2] and own >= 0:
+                    for j in range(candidates.shape[2]):
+                        if candidates[b, splat, j] == own:
+                            wp.atomic_add(credits_, b, splat, j, weight)
+                through = through * (real(1.0) - alpha)
+        transmittance[b, tile, pixel] = through
+
+    name = "float" if single else "double"
+    return ListKernels(
+        launcher(list_slots, f"list_slots_{name}", 2, ("tile", "rank")),
+        launcher(credit, f"credit_{name}", 2, ("credits_",)),
+    )
+
+
+@functools.cache
+@no_type_check
+def radix_sort() -> Any:
+    """A stable sort of (tile, rank) by tile, as a function of JAX arrays: keys and values of each image.
+
+    Keys and values have room for twice their number, which a radix sort needs; it sorts the first half. A third array
+    has as many entries as there are keys, which tells the bits to sort by.
+    """
+    wp = import_warp()
+
+    def sort_slots(
+        tile: wp.array2d(dtype=wp.int32), rank: wp.array2d(dtype=wp.int32), keys: wp.array2d(dtype=wp.int32)
+    ):
+        bits = max(int(keys.shape[1] - 1).bit_length(), 1)
+        for image in range(tile.shape[0]):
+            wp.utils.radix_sort_pairs(tile[image], rank[image], tile.shape[1] // 2, 0, bits)
+
+    return caller(sort_slots, "sort_slots", 2, ("tile", "rank"))
