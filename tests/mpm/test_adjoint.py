@@ -189,9 +189,6 @@ def test_integers_of_the_state_pass(x64):
         after, own = end(shared, state, between, state["count"])
         return after | {"count": state["count"] + 1}, own
 
-    def counted(shared, state, number):
-        return begin(shared, state, state["count"])
-
     shared, state = inputs()
     own = steps(7, 3, False)._replace(begin=counted, end=counting, passive={"x": False, "weight": True, "count": False})
 
