@@ -1,4 +1,4 @@
-"""Tests run with strict JAX modes and, where `PIGJAX_CHECK_SHAPES=1`, with jaxtyping + beartype on the whole package."""
+"""Strict JAX modes; with `PIGJAX_CHECK_SHAPES=1` jaxtyping + beartype check the whole package."""
 
 import gc
 import os
