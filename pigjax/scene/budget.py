@@ -42,9 +42,7 @@ class Budget:
     """Bounds on a run; None: no bound."""
 
     time: float | int | None = None  # of the whole run, compilation included [s]
-    error: float | int | None = (
-        None  # of the motion, as a share of the distance travelled, and of the colours by drawing
-    )
+    error: float | int | None = None  # of the motion, as a share of its distance, and of the colours by drawing
     memory: float | int | None = None  # of the process [bytes]
 
     @property

@@ -6,6 +6,8 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from needs import NEEDS, PRICES, scaled
+from scenes import ball, values, write_throw
 from typer.testing import CliRunner
 
 from pigjax import io
@@ -15,30 +17,12 @@ from pigjax.scene import budget as budgets
 from pigjax.scene import load_scene, plan_scene, run_scene, scene_from
 from pigjax.scene.arrangement import arrange
 from pigjax.scene.budget import Budget, Choice, bound, choose, front_of
-from pigjax.scene.costs import Body, Pace, Prices, Required, matter_error, predict, run_parts, shipped_prices
+from pigjax.scene.costs import Body, Pace, matter_error, predict, run_parts, shipped_prices
 from pigjax.scene.plan import make_plan, read_inputs, segment
 from pigjax.scene.required import counted, required_by, shape_of, survey
 from pigjax.scene.run_error import Followed, estimated_error
 from pigjax.scene.schema import values_of
 from pigjax.scene.stages import stages_of
-from tests.helpers.scenes import ball, values, write_throw
-
-NEEDS = Required(
-    bodies=(Body("duck", "neo_hookean", 1000, 8.0), Body("heap", "drucker_prager", 500, 8.0)),
-    dx=0.02, nodes=4096, frames=10, substeps=20, gaussians=3000, moving=900, still=100, still_objects=1,
-    sh_coefficients=4, colliders=1, pixels=64 * 48, states=11,
-)  # fmt: skip
-PRICES = Prices(
-    run={"simulate": {"law neo_hookean": 1e-6, "law drucker_prager": 3e-6}, "draw": {"pixels": 1e-6}},
-    compile={"simulate": {"start": 2.0}},
-    memory={"start": 1e9, "particles": 1000.0},
-    error={"neo_hookean": 0.05, "drucker_prager": 0.2},
-    probe={"step": 0.1},
-)
-
-
-def scaled(needs, factor):
-    return dataclasses.replace(needs, bodies=tuple(b._replace(particles=factor * b.particles) for b in needs.bodies))
 
 
 def test_prices_add_up():
