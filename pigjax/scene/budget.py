@@ -18,7 +18,7 @@ from pigjax.scene.costs import Prediction, Prices, Required, duration, predict, 
 from pigjax.scene.probe import speed_against
 from pigjax.scene.report import RunReport
 from pigjax.scene.report_page import left_out
-from pigjax.scene.required import required_by, survey
+from pigjax.scene.required import drawn, required_by, survey
 from pigjax.scene.schema import Scene
 
 # knobs that are Pareto members of docs/results/TRADEOFF.md: factors on dx, a longer step, and drawings
@@ -145,8 +145,13 @@ def plan_scene(
     looked = survey(scene)
     speed = speed_against(prices.probe) if probe else {}
 
+    known: dict[tuple[Any, ...], Required] = {}  # of settings of the matter, which take longer than a product
+
     def choice(changes: dict[str, dict[str, Any]]) -> Choice:
-        needs = required_by(looked, changed(looked.scene, changes))
+        there, matter = changed(looked.scene, changes), tuple(changes.get("simulation", {}).items())
+        if matter not in known:
+            known[matter] = required_by(looked, there)
+        needs = drawn(known[matter], there)
         return Choice(changes, needs, predict(needs, prices, speed=speed or None))
 
     given = choice({})

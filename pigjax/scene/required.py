@@ -35,6 +35,7 @@ _COARSE = 4  # mask pixels to one of the depth map of centres
 _BEHIND = 1.03  # times the nearest depth: centres farther away are hidden
 _VOXELS = 32  # along the longest side of an object
 _SAMPLE = 5_000  # Gaussians whose nearest neighbour is looked for
+_GAPS = 1.8  # distances to the third neighbour in a voxel: smaller ones leave holes in shells
 _SIDES = 5  # of the six sides, from which an inner voxel is hidden: what stands on a table is open below
 _ROOM, _AROUND, _UNIT = 1.3, 7, 4  # of the active grid, see `ActiveGrid`
 
@@ -159,7 +160,7 @@ def shape_of(means: Float[np.ndarray, "n 3"]) -> Shape:
     low, high = means.min(0), means.max(0)
     some = means[:: max(len(means) // _SAMPLE, 1)]
     gap = float(np.median(cKDTree(means).query(some, k=min(4, len(means)))[0][:, -1])) if len(means) > 3 else 0.0
-    voxel = max(float((high - low).max()) / _VOXELS, 1.2 * gap) or 1.0
+    voxel = max(float((high - low).max()) / _VOXELS, _GAPS * gap) or 1.0
     place = np.floor((means - low) / voxel).astype(int) + 2
     held = np.zeros(place.max(0) + 3, bool)
     held[tuple(place.T)] = True
@@ -169,7 +170,7 @@ def shape_of(means: Float[np.ndarray, "n 3"]) -> Shape:
         hidden += np.maximum.accumulate(held, axis)
         hidden += np.flip(np.maximum.accumulate(np.flip(held, axis), axis), axis)
     inner = ~held & (hidden >= _SIDES)
-    solid = held | inner
+    solid = ndimage.binary_closing(held | inner, np.ones((3, 3, 3), bool))
     deep = ndimage.binary_erosion(solid)
     fullness = np.where(deep, 1.0, np.where(solid, 0.5, 0.0)) if deep.any() else np.zeros(solid.shape)
     return Shape(means, fullness, low - 2 * voxel, voxel)
@@ -223,6 +224,22 @@ def required_by(survey: Survey, scene: Scene | None = None) -> Required:
     )  # fmt: skip
 
 
+def drawn(needs: Required, scene: Scene) -> Required:
+    """The same matter with the pictures' size and threshold of another scene.
+
+    Args:
+        needs: of a scene.
+        scene: with another `drawing`.
+    """
+    spec = scene.drawing
+    return replace(needs, pixels=_pixels(scene), scale=spec.scale, alpha_min=spec.alpha_min)
+
+
+def _pixels(scene: Scene) -> int:
+    width, height = (max(round(side * scene.drawing.scale), 1) for side in (scene.camera.width, scene.camera.height))
+    return width * height
+
+
 def _forces(scene: Scene, particles: Particles, names: list[str]) -> tuple[Force, ...]:
     """Those of the scene on the corners of its objects; none where they pick matter that corners do not show."""
     try:
@@ -274,7 +291,6 @@ def _required(
     of_kind = {fixed: _members(object_id, inputs.ids, scene, fixed=fixed) for fixed in (False, True)}
     sides = np.ceil((x.max(0) - x.min(0)) / dx) + _AROUND
     nodes = math.prod(int(-(-side * _ROOM // _UNIT)) * _UNIT for side in sides)
-    width, height = (max(round(side * drawing.scale), 1) for side in (scene.camera.width, scene.camera.height))
     total = inputs.gaussians.sh.shape[1]
     drawn = total if drawing.sh_degree is None else min((drawing.sh_degree + 1) ** 2, total)
     every, frames = scene.output.states_every, spec.frames
@@ -292,7 +308,7 @@ def _required(
         still_objects=sum(entry.fixed for entry in scene.objects.values()),
         sh_coefficients=drawn,
         colliders=len(scene.colliders()),
-        pixels=width * height,
+        pixels=_pixels(scene),
         photos=photos,
         photo_pixels=pixels,
         voted=voted,
