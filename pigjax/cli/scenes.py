@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from importlib import resources
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from msgspec import structs
@@ -95,7 +95,7 @@ def _run(
     *,
     drop_invalid: bool = False,
     overwrite: bool = False,
-    budget: dict[str, str | None] | None = None,
+    budget: dict[str, Any] | None = None,
 ) -> None:
     prepare_jax()
     from pigjax.scene import load_scene, plan_scene, run_scene

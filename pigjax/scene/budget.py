@@ -72,9 +72,9 @@ class Choice:
                 fields.items()]  # fmt: skip
 
     @property
-    def cost(self) -> tuple[float, float, float]:
-        """Numbers of which less is better: time, error of motion, error of colour."""
-        return self.prediction.seconds, self.prediction.error, self.prediction.picture_error
+    def cost(self) -> tuple[float, float]:
+        """Numbers of which less is better: time, and error of motion and of colour as one root of squares."""
+        return self.prediction.seconds, math.hypot(self.prediction.error, self.prediction.picture_error)
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,7 @@ def _drawing(scene: Scene, fields: Mapping[str, float]) -> dict[str, float]:
 
 
 def front_of(choices: Iterable[Choice]) -> list[Choice]:
-    """Those that no other choice beats in time, error of motion and error of colour; quickest first.
+    """Those that no other choice beats in time and error; quickest first.
 
     Args:
         choices: any.
@@ -247,7 +247,7 @@ def choose(budget: Budget, choices: list[Choice]) -> Choice:
         return own
     if budget.error is not None:
         return min(kept, key=lambda c: c.cost)
-    return min(kept, key=lambda c: (max(c.prediction.error, c.prediction.picture_error), *c.cost))
+    return min(kept, key=lambda c: c.cost[::-1])
 
 
 def _refusal(budget: Budget, choices: list[Choice]) -> str:

@@ -56,7 +56,8 @@ def _seconds(run: Callable[[], Any]) -> float:
 
 def _step() -> Callable[[], Any]:
     x = np.random.default_rng(0).random((_PARTICLES, 3)) * 0.3 + 0.35
-    table = material_table([Material("neo_hookean", density=1000.0, young=1e5, poisson=0.2)])
+    jelly: dict[str, Any] = {"model": "neo_hookean", "density": 1000.0, "young": 1e5, "poisson": 0.2}
+    table = material_table([Material(**jelly)])
     start = make_particles(jnp.asarray(x, jnp.float32), volume=0.3**3 / _PARTICLES, table=table)
     grid = Grid(jnp.zeros(3), jnp.float32(1 / _NODES), (_NODES,) * 3)
     config = SimConfig(substeps=_SUBSTEPS)

@@ -131,7 +131,9 @@ def _objects(scene: Scene, report: RunReport) -> str:
 
 
 def _times(report: RunReport) -> str:
-    rows = [(name, f"{t.run:.2f}", f"{t.compile:.2f}", f"{t.total:.2f}") for name, t in report.times.items()]
+    rows: list[tuple[str, ...]] = [
+        (name, f"{t.run:.2f}", f"{t.compile:.2f}", f"{t.total:.2f}") for name, t in report.times.items()
+    ]
     total = [sum(getattr(t, part) for t in report.times.values()) for part in ("run", "compile", "total")]
     rows.append(("all", *(f"{value:.2f}" for value in total)))
     if told := report.predicted:

@@ -250,6 +250,15 @@ def test_a_plan_keeps_its_budget_and_changes_only_the_knobs(scene):
         plan_scene(scene, time=0.001, probe=False)
 
 
+@pytest.mark.slow
+def test_the_probe_measures_each_task_once_in_a_process():
+    from pigjax.scene.probe import probe, speed_against
+
+    assert set(probe()) == {"step", "picture", "host"}
+    assert all(seconds > 0 for seconds in probe().values())
+    assert speed_against({**probe(), "step": probe()["step"] / 2}) == {"step": 2.0, "picture": 1.0, "host": 1.0}
+
+
 # runs
 
 
