@@ -24,6 +24,7 @@ from pigjax.cli.base import (
 
 if TYPE_CHECKING:  # the scene's packages load JAX, which the list of commands does not need
     from pigjax.scene import ScenePlan
+    from pigjax.scene.budget import Choice
 
 Time = Annotated[str | None, typer.Option("--time", help="Most time of the run: 60, '2 min', '1 h'.")]
 Error = Annotated[str | None, typer.Option("--error", help="Largest error of motion and colours, as a share or '1%'.")]
@@ -31,6 +32,7 @@ Memory = Annotated[str | None, typer.Option("--memory", help="Most memory of the
 Accuracy = Annotated[
     str | None, typer.Option("--accuracy", help="draft, standard or reference, instead of the scene file's.")
 ]
+_QUICKER = 0.95  # time of a row of the front over that of the next
 _LEAST = 0.01  # share of the time from which a part is listed by itself
 
 
@@ -70,7 +72,7 @@ def plan(
         asked = changed(asked, {"input": {"drop_invalid": True}})
     if out is not None:
         io.output_folder(out.parent, files=(out.name,))
-    console.print(said("reading the scene and timing small tasks on this machine ..."))
+    console.print(said("reading the scene ..."))
     found = plan_scene(asked, time=time, error=error, memory=memory)
     tell(found, str(scene))
     if out is not None:
@@ -122,9 +124,13 @@ def _prices(found: ScenePlan) -> Table:
 
 
 def _front(found: ScenePlan) -> Table:
-    """Settings that no other beats, for each time its most accurate: what is lost by going faster."""
+    """Settings that no other beats: what is lost by going faster; of those of about one time the most accurate."""
     table = Table("s", "error of motion", "error of colours", "GB", "settings")
-    for choice in found.front:
+    rows: list[Choice] = []
+    for choice in reversed(found.front):
+        if not rows or choice is found.chosen or choice.prediction.seconds < _QUICKER * rows[-1].prediction.seconds:
+            rows.append(choice)
+    for choice in reversed(rows):
         p = choice.prediction
         settings = ", ".join(choice.settings) or "as they are"
         mark = " (chosen)" if choice is found.chosen else ""

@@ -84,7 +84,7 @@ class ScenePlan:
     scene: Scene  # with the chosen settings
     chosen: Choice
     given: Choice  # the scene's own settings
-    front: tuple[Choice, ...]  # settings that no other beats in time and error, quickest first
+    front: tuple[Choice, ...]  # settings that no other beats in time and error, and the chosen ones, quickest first
     budget: Budget
     left_out: list[str]  # what is not modelled, with the setting that would
     speed: dict[str, float]  # time of the small tasks of the probe here over that on the prices' machine
@@ -164,7 +164,7 @@ def plan_scene(
         scene=changed(scene, best.changes),
         chosen=best,
         given=given,
-        front=tuple(front_of(choices)),
+        front=tuple(sorted([*(c for c in front_of(choices) if c is not best), best], key=lambda c: c.cost)),
         budget=budget,
         left_out=left_out(scene, report),
         speed=speed,

@@ -41,6 +41,8 @@ def speed_against(measured: Mapping[str, float]) -> dict[str, float]:
     Args:
         measured: seconds of the tasks there; tasks that it lacks are left out.
     """
+    if not measured:
+        return {}
     return {name: seconds / measured[name] for name, seconds in probe().items() if measured.get(name, 0) > 0}
 
 
