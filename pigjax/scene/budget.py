@@ -82,10 +82,10 @@ class ScenePlan:
     """What a run requires and costs, and the settings that keep a budget; `plan_scene` makes it."""
 
     scene: Scene  # with the chosen settings
-    chosen: Choice
+    chosen: Choice  # the settings that keep the budget
     given: Choice  # the scene's own settings
     front: tuple[Choice, ...]  # settings that no other beats in time and error, and the chosen ones, quickest first
-    budget: Budget
+    budget: Budget  # bounds that were asked for
     left_out: list[str]  # what is not modelled, with the setting that would
     speed: dict[str, float]  # time of the small tasks of the probe here over that on the prices' machine
     source: str  # machine on which the prices were measured
