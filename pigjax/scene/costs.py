@@ -378,7 +378,9 @@ class Pace:
         if math.floor(4 * share) == math.floor(4 * (frame - 1) / self.frames) or frame == self.frames:
             return None
         stages = ("simulate",) if self.apart else ("simulate", "draw")
-        expected = sum(self.predicted.compile[s] + share * self.predicted.run[s] for s in stages)
+        own = [part for part in self.predicted.parts if "estimated error" not in part.name]  # that run comes later
+        compiled = (p.seconds for p in own if p.stage == "compile" and p.name.partition(":")[0] in stages)
+        expected = math.fsum(compiled) + share * math.fsum(p.seconds for p in own if p.stage in stages)
         spent = time.perf_counter() - self.begun
         return f"frame {frame} of {self.frames}: {duration(spent)} since the first, {duration(expected)} predicted"
 
