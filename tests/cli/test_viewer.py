@@ -191,7 +191,7 @@ def test_a_draft_refuses_what_a_scene_cannot_be_and_stays_as_it_was(folder):
         draft.write("scene.toml")
 
 
-@pytest.mark.parametrize("name", ["../evil", "/tmp/evil", "a/b", "..", "x\0y", ""])
+@pytest.mark.parametrize("name", ["../evil", "/evil", "a/b", "..", "x\0y", ""])
 def test_nothing_is_written_outside_of_the_opened_folder(folder, tmp_path, name):
     home = tmp_path / "inside"
     draft = Draft(open_path(folder / "scene.toml").values, folder, home)

@@ -33,7 +33,7 @@ class Page:
     def __init__(self, session: Session, server: Any) -> None:
         self.session, self.server = session, server
         self.playing = False
-        self.stale = False  # whether the scene was changed in a way that a restart is needed for
+        self.stale = False  # whether a change of the scene needs a restart
         self._pending: dict[str, Callable[[], None]] = {}
         self._wake = threading.Condition()
         self._closing = False
