@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -111,6 +113,7 @@ class RenderConfig(eqx.Module):
             )
 
 
+@partial(jax.jit, inline=True)
 def gaussian_factors(gaussians: Gaussians) -> Float[Array, "n 3 3"]:
     """Factors M = R S of the covariances M Mᵀ [m] (Kerbl et al. 2023, equation 6)."""
     return quat_to_matrix(gaussians.quats) * jnp.exp(gaussians.log_scales)[:, None, :]
@@ -118,8 +121,11 @@ def gaussian_factors(gaussians: Gaussians) -> Float[Array, "n 3 3"]:
 
 def as_splats(gaussians: Gaussians | Splats) -> Splats:
     """Gaussians in their rest pose as splats; splats as they are."""
-    if isinstance(gaussians, Splats):
-        return gaussians
+    return gaussians if isinstance(gaussians, Splats) else _at_rest(gaussians)
+
+
+@partial(jax.jit, inline=True)
+def _at_rest(gaussians: Gaussians) -> Splats:
     opacities = jax.nn.sigmoid(gaussians.logit_opacities)
     return Splats(gaussians.means, gaussian_factors(gaussians), opacities, gaussians.sh)
 
