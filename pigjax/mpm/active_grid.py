@@ -25,7 +25,7 @@ from pigjax.mpm.materials import LAWS, MaterialTable
 from pigjax.mpm.program import AXIS, GridWindow, StepInputs, run_frames
 
 LARGEST = 200_000_000  # nodes
-_ROOM = 1.3  # factor on the sides that a window needs: another size is another compilation
+_ROOM = 1.4  # factor on the sides that a window needs: another size is another compilation
 _ROOM_OF_ONE = 1.15  # the same for a window of fixed size, for motion that is faster than the runs that sized it
 _UNIT = 4  # nodes, of which sides are multiples
 _AROUND = 6  # nodes a side of a window of fixed size beyond the extent of matter: the kernel's, and some room

@@ -121,11 +121,8 @@ def gaussian_factors(gaussians: Gaussians) -> Float[Array, "n 3 3"]:
 
 def as_splats(gaussians: Gaussians | Splats) -> Splats:
     """Gaussians in their rest pose as splats; splats as they are."""
-    return gaussians if isinstance(gaussians, Splats) else _at_rest(gaussians)
-
-
-@partial(jax.jit, inline=True)
-def _at_rest(gaussians: Gaussians) -> Splats:
+    if isinstance(gaussians, Splats):
+        return gaussians
     opacities = jax.nn.sigmoid(gaussians.logit_opacities)
     return Splats(gaussians.means, gaussian_factors(gaussians), opacities, gaussians.sh)
 
