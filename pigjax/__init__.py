@@ -33,6 +33,7 @@ from pigjax.io import (
 )
 from pigjax.mls_mpm import SimConfig, rollout, step
 from pigjax.mpm import Grid, Health, Particles, Trajectory, fit_grid, make_particles, vast_grid
+from pigjax.mpm.active_grid import choose_box
 from pigjax.mpm.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.forces import Force, ForceField, Impulse, Spring, Wind, grab
@@ -111,6 +112,7 @@ __all__ = [
     "at_frame",
     "bind",
     "boundary_iou",
+    "choose_box",
     "choose_integrator",
     "choose_substeps",
     "collider_from_gaussians",

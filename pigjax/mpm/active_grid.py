@@ -19,6 +19,8 @@ from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float
 
+from pigjax.core.arguments import checked
+from pigjax.core.arrays import Vector
 from pigjax.core.errors import SimulationError
 from pigjax.mpm import WALL, Grid, Health, Particles, SimConfig, Trajectory
 from pigjax.mpm.materials import LAWS, MaterialTable
@@ -130,6 +132,39 @@ def box_for(
     needed = np.ceil(2 * half / float(domain.dx)) + _AROUND
     nx, ny, nz = map(int, np.clip(np.ceil(needed * _ROOM_OF_ONE), 2 * WALL + 2, domain.shape))
     return (nx, ny, nz) if 2 * _nodes((nx, ny, nz)) <= _nodes(domain.shape) else None
+
+
+@checked
+def choose_box(
+    particles: Particles,
+    path: Trajectory,
+    grid: Grid,
+    table: MaterialTable,
+    *,
+    frame_dt: Float[Array, ""] | float,
+    gravity: Vector,
+) -> tuple[int, int, int] | None:
+    """A `SimConfig.box` for rollouts like one that is known (host).
+
+    Inside jit, grad and vmap a rollout visits all nodes of its grid, unless it has such a box. Simulate once outside,
+    at the extremes of the parameters where they matter, and take the largest box. Matter that outruns a box is held
+    back at its edge and counted in `Health.escaped`.
+
+        end, path, health = pj.rollout(particles, grid, table, config, frames=24, frame_dt=1 / 24, gravity=gravity)
+        config = replace(config, box=pj.choose_box(particles, path, grid, table, frame_dt=1 / 24, gravity=gravity))
+
+    Args:
+        particles: at the start.
+        path: of that rollout.
+        grid: the whole domain.
+        table: materials.
+        frame_dt: duration of a frame [s].
+        gravity: [m/s²].
+
+    Returns:
+        Nodes a side, with 15 % more than the rollout used; None where a box would hold more than half of the domain.
+    """
+    return box_for([(particles, path, float(frame_dt), gravity)], table, grid)
 
 
 def window_around(
