@@ -14,6 +14,7 @@ from pigjax.core.placing import as_gaussians, placed
 from pigjax.core.regions import BoxRegion, HalfSpace, SphereRegion
 from pigjax.core.upright import Upright, find_up
 from pigjax.coupling.binding import at_frame, bind, deform
+from pigjax.coupling.hidden import fill_hidden
 from pigjax.coupling.outliers import cut_outliers
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
@@ -125,6 +126,7 @@ __all__ = [
     "experiment",
     "export_run",
     "extract_object",
+    "fill_hidden",
     "fill_unseen",
     "find_up",
     "fit",

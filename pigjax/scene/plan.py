@@ -57,7 +57,8 @@ class Inputs:
     own: dict[str, Gaussians] = field(default_factory=dict)  # of the objects that have a file of their own
     world: Float[np.ndarray, "4 4"] | None = None  # transform from the files; None: none
     labels: Labels | None = None  # where the scale of the world needed them
-    arranged: bool = False  # whether objects were placed, copied or removed
+    arranged: bool = False  # whether objects were placed, copied, removed or filled
+    filled: dict[str, dict[str, int]] = field(default_factory=dict)  # Gaussians "added" and "recoloured", by object
 
     @property
     def moved(self) -> bool:

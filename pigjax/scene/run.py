@@ -242,6 +242,8 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
         "dx": plan.dx,
         "mass_kg": float(plan.particles.mass.sum()),
     }
+    if inputs.filled:
+        report.sizes["filled"] = inputs.filled
 
 
 def _particles_of(
