@@ -75,8 +75,8 @@ class ForceSpec(Section, frozen=True, kw_only=True):
 class WindSpec(ForceSpec, frozen=True, kw_only=True):
     """Wind that drags matter along; see `Wind`."""
 
-    kind: Literal["wind"]
-    velocity: Annotated[_Triple, _SPEED]
+    kind: Literal["wind"]  # which force it is
+    velocity: Annotated[_Triple, _SPEED]  # of the air
     drag: Annotated[float, Limits(0, 1e9, unit="1/s")] = 2.0  # rate at which matter takes the wind's velocity
     quadratic_drag: Annotated[float, Limits(0, 1e9, unit="1/m")] | None = None  # the same per speed; None: 0
     gusts: Annotated[float, Limits(0, 1e6, unit="m/s")] | None = None  # root mean square of their speed; None: steady
@@ -88,8 +88,8 @@ class WindSpec(ForceSpec, frozen=True, kw_only=True):
 class FieldSpec(ForceSpec, frozen=True, kw_only=True):
     """An acceleration that is uniform or linear in space; see `ForceField`."""
 
-    kind: Literal["field"]
-    acceleration: Annotated[_Triple, Limits(-1e9, 1e9, unit="m/s²")] = (0.0, 0.0, 0.0)
+    kind: Literal["field"]  # which force it is
+    acceleration: Annotated[_Triple, Limits(-1e9, 1e9, unit="m/s²")] = (0.0, 0.0, 0.0)  # at the centre
     # by row the derivatives of one component
     gradient: Annotated[tuple[_Triple, _Triple, _Triple], Limits(-1e9, 1e9, unit="1/s²")] | None = None
     centre: Annotated[_Triple, _PLACE] | None = None  # where the acceleration is as given; None: the origin
@@ -105,7 +105,7 @@ class FieldSpec(ForceSpec, frozen=True, kw_only=True):
 class ImpulseSpec(ForceSpec, frozen=True, kw_only=True):
     """A blow, shared by mass; see `Impulse`."""
 
-    kind: Literal["impulse"]
+    kind: Literal["impulse"]  # which force it is
     momentum: Annotated[_Triple, Limits(-1e9, 1e9, unit="N s")]  # that matter receives in all
     force = Impulse
 
@@ -113,10 +113,11 @@ class ImpulseSpec(ForceSpec, frozen=True, kw_only=True):
 class SpringSpec(ForceSpec, frozen=True, kw_only=True):
     """A spring and damper from the middle of matter, picked at rest, to a point that may move; see `Spring`."""
 
-    kind: Literal["spring"]
-    target: Annotated[_Triple, _PLACE] | None = None  # None: the middle of the picked matter
+    kind: Literal["spring"]  # which force it is
+    target: Annotated[_Triple, _PLACE] | None = None  # end of the spring; None: the middle of the picked matter
     velocity: Annotated[_Triple, _SPEED] | None = None  # of the target; None: it is still
-    stiffness: Annotated[float, Limits(0, 1e12, above=True, unit="N/m")]
+    stiffness: Annotated[float, Limits(0, 1e12, above=True, unit="N/m")]  # force for each metre between the two
+    # force for each m/s between the two; 0: it swings on
     damping: Annotated[float, Limits(0, 1e12, unit="N s/m")] = 0.0
     force = Spring
 

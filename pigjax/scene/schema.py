@@ -63,8 +63,12 @@ class InputSpec(Section, frozen=True):
 class SegmentationSpec(Section, frozen=True):
     """Thresholds of the vote (paper 3.2)."""
 
+    # the surface of a pixel is where the transmittance falls below it; the paper's value
     tau_T: Annotated[float, Limits(0, 1)] = 0.5
+    # a Gaussian on the surface differs from its depth by at most this share; inside a broad plateau of scores
     tau_d: Annotated[float, Limits(0, 1)] = 0.03
+    # "vote": pixels without an object vote for the background; by default they say nothing, since masks are often
+    # incomplete
     background: Literal["ignore", "vote"] = "ignore"
     fill_unseen: bool = True  # unseen Gaussians take the id of their neighbours
 
@@ -74,31 +78,41 @@ class SimulationSpec(Section, frozen=True):
 
     # grid spacing; None: a sixteenth of the smallest moving object's size, see `default_dx`
     dx: Annotated[float, _LENGTH] | None = None
-    frames: Annotated[int, Limits(1, 100_000)] = 48
+    frames: Annotated[int, Limits(1, 100_000)] = 48  # of the video; 48 are two seconds
+    # frames of the video in a second; that of films
     fps: Annotated[float, Limits(0, 1e4, above=True, unit="1/s")] = 24.0
     gravity: Annotated[float | Triple, Limits(-1e6, 1e6, unit="m/s²")] = 9.81  # downwards, or a vector
     slow_motion: Annotated[float, Limits(0, 1e9, above=True)] = 1.0  # simulated time is shown this many times slower
+    # matter that fills a cell of the grid: 2 along each axis, with which no gaps open as it stretches a little
     particles_per_cell: Annotated[float, Limits(0, 1e4, above=True)] = 8.0
     fill: bool = True  # fill objects inside
+    # largest part of a cell that waves and matter cross in one step; 0.4 leaves room for matter that stiffens when
+    # pressed
     cfl: Annotated[float, Limits(0, 1, above=True)] = 0.4
+    # B-spline between particles and grid; "cubic" is smoother and dearer
     kernel: Literal["quadratic", "cubic"] = "quadratic"
+    # "implicit" takes steps of a frame or so, for matter stiffer than about 1e8 Pa; "auto" chooses by the cost
     integrator: Literal["explicit", "implicit", "auto"] = "explicit"
     # of objects on each other, which then never fuse; None: one common field
     contact_friction: Annotated[float, _FRICTION] | None = None
     # objects slower than this are left out until touched; None: never
     sleep: Annotated[float, Limits(0, 1e3, above=True, unit="cells/frame")] | None = None
-    seed: Annotated[int, Limits(0, LARGEST_WHOLE)] = 0
+    seed: Annotated[int, Limits(0, LARGEST_WHOLE)] = 0  # of the jitter of filled particles
 
 
 class ClampSpec(Section, frozen=True):
     """The adaptive eigen-clamp (paper 3.3)."""
 
+    # how shapes follow: "aligned" matches axes first, "literal" is the paper as printed, "covariance" is unbounded,
+    # "fixed" keeps shapes at rest
     mode: Literal["aligned", "literal", "covariance", "fixed"] = "aligned"
-    tau_min: Annotated[float, Limits(0, 1e9)] = 0.5
+    tau_min: Annotated[float, Limits(0, 1e9)] = 0.5  # lower bound of a splat's scales; with the default they may halve
+    # upper bound of a splat's scales; with the default they may double, which ends before needles show
     tau_max: Annotated[float, Limits(0, 1e9, above=True)] = 2.0
+    # how far axes go from those at rest, turned as the matter, towards those of the deformed splat (1); the paper's
     lambda_R: Annotated[float, _WEIGHT] = 1.2
-    lambda_S: Annotated[float, _WEIGHT] = 0.8
-    relative: bool = True
+    lambda_S: Annotated[float, _WEIGHT] = 0.8  # how far scales follow within their bounds; the paper's value
+    relative: bool = True  # bounds are shares of each splat's own scale at rest; false: lengths in m
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """Bounds are in order."""
@@ -114,14 +128,14 @@ class CameraSpec(Section, frozen=True):
 
     view: str | None = None  # name of a photo whose camera is taken
     target: Annotated[Triple, _PLACE] | None = None  # centre of the orbit; None: middle of the moving objects
-    radius: Annotated[float, _LENGTH] | None = None  # None: twice the median distance of the scene's core
-    elevation: Annotated[float, Limits(-90, 90, unit="degrees")] = 30.0
+    radius: Annotated[float, _LENGTH] | None = None  # of the orbit; None: twice the median distance of the scene's core
+    elevation: Annotated[float, Limits(-90, 90, unit="degrees")] = 30.0  # of an orbit, above the horizon
     start: Annotated[float, _ANGLE] = 0.0  # azimuth of the first frame
     sweep: Annotated[float, _ANGLE] = 0.0  # azimuth covered by the video
     field_of_view: Annotated[float, Limits(0, 180, above=True, below=True, unit="degrees")] = 45.0  # horizontal
-    width: Annotated[int, _PIXELS] = 512
-    height: Annotated[int, _PIXELS] = 512
-    background: Annotated[float | Triple, Limits(0, 1)] = 0.0
+    width: Annotated[int, _PIXELS] = 512  # of the video
+    height: Annotated[int, _PIXELS] = 512  # of the video
+    background: Annotated[float | Triple, Limits(0, 1)] = 0.0  # grey, or red, green and blue, behind all splats
 
     @property
     def is_open(self) -> bool:
@@ -174,9 +188,9 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     removed: bool = False  # its splats are left out, as if it had never stood there
     fixed: bool = False  # a still collider made from its own splats
     friction: Annotated[float, _FRICTION] = 0.5  # Coulomb's coefficient of a fixed object
-    material: str | None = None
-    model: str | None = None
-    velocity: Annotated[Triple, _SPEED] = (0.0, 0.0, 0.0)
+    material: str | None = None  # name of a preset; its numbers may be replaced by the fields below
+    model: str | None = None  # name of a law, instead of a preset; its numbers follow
+    velocity: Annotated[Triple, _SPEED] = (0.0, 0.0, 0.0)  # at its start
     angular_velocity: Annotated[Triple, Limits(-1e6, 1e6, unit="rad/s")] = (0.0, 0.0, 0.0)  # about its centre of mass
     start: Annotated[float, Limits(0, 1e6, unit="s")] = 0.0  # simulated time until which it stands still, as a rock
     density: Annotated[float, Limits(unit="kg/m³")] | None = None
@@ -249,11 +263,14 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
 class ColliderSpec(Section, frozen=True, kw_only=True):
     """Fields of all colliders: contact, pose and motion; the numbers of `Collider`."""
 
+    # Coulomb's coefficient in mode "separate"; 0.5 is that of many dry pairs
     friction: Annotated[float, _FRICTION] = 0.5
+    # "sticky" holds matter, "slip" lets it slide but not leave, "separate" lets it slide with friction and leave
     mode: Literal["sticky", "slip", "separate"] = "separate"
-    velocity: Annotated[Triple, _SPEED] | None = None
+    velocity: Annotated[Triple, _SPEED] | None = None  # of a collider that moves; None: it is still
+    # about its pivot; None: it does not turn
     angular_velocity: Annotated[Triple, Limits(-1e6, 1e6, unit="rad/s")] | None = None
-    rotation: Annotated[tuple[float, float, float, float], _WEIGHT] | None = None  # quaternion wxyz
+    rotation: Annotated[tuple[float, float, float, float], _WEIGHT] | None = None  # quaternion wxyz; None: not turned
     pivot: Annotated[Triple, _PLACE] | None = None  # centre of its rotation; None: its middle
     shape: ClassVar[type[Collider]]
 
@@ -272,42 +289,42 @@ class ColliderSpec(Section, frozen=True, kw_only=True):
 class PlaneSpec(ColliderSpec, frozen=True, kw_only=True):
     """A half space that matter cannot enter."""
 
-    point: Annotated[Triple, _PLACE]
-    normal: Annotated[Triple, _WEIGHT]
+    point: Annotated[Triple, _PLACE]  # on the plane
+    normal: Annotated[Triple, _WEIGHT]  # of any length, towards the free side
     shape = Plane
 
 
 class BoxSpec(ColliderSpec, frozen=True, kw_only=True):
     """A solid box, along the axes unless turned."""
 
-    lower: Annotated[Triple, _PLACE]
-    upper: Annotated[Triple, _PLACE]
+    lower: Annotated[Triple, _PLACE]  # corner
+    upper: Annotated[Triple, _PLACE]  # corner
     shape = Box
 
 
 class SphereSpec(ColliderSpec, frozen=True, kw_only=True):
     """A solid ball."""
 
-    centre: Annotated[Triple, _PLACE]
-    radius: Annotated[float, _LENGTH]
+    centre: Annotated[Triple, _PLACE]  # of the ball
+    radius: Annotated[float, _LENGTH]  # of the ball
     shape = Sphere
 
 
 class CapsuleSpec(ColliderSpec, frozen=True, kw_only=True):
     """A solid rod with round ends about two points of its axis."""
 
-    start: Annotated[Triple, _PLACE]
-    end: Annotated[Triple, _PLACE]
-    radius: Annotated[float, _LENGTH]
+    start: Annotated[Triple, _PLACE]  # of its axis
+    end: Annotated[Triple, _PLACE]  # of its axis
+    radius: Annotated[float, _LENGTH]  # about its axis
     shape = Capsule
 
 
 class CylinderSpec(ColliderSpec, frozen=True, kw_only=True):
     """A solid cylinder with flat ends in two points of its axis."""
 
-    start: Annotated[Triple, _PLACE]
-    end: Annotated[Triple, _PLACE]
-    radius: Annotated[float, _LENGTH]
+    start: Annotated[Triple, _PLACE]  # of its axis
+    end: Annotated[Triple, _PLACE]  # of its axis
+    radius: Annotated[float, _LENGTH]  # about its axis
     shape = Cylinder
 
 
@@ -323,7 +340,7 @@ class Scene(Section, frozen=True):
     camera: CameraSpec = CameraSpec()  # of the video
     drawing: DrawingSpec = DrawingSpec()  # accuracy of the video
     output: OutputSpec = OutputSpec()  # states that stay
-    accuracy: Accuracy = "standard"  # sets the fields that the file leaves open, and scales its dx; see `accuracy`
+    accuracy: Accuracy = "standard"  # sets the fields that the file leaves open, and scales its dx
     planes: dict[str, PlaneSpec] = field(default_factory=dict)  # colliders by name
     boxes: dict[str, BoxSpec] = field(default_factory=dict)  # colliders by name
     spheres: dict[str, SphereSpec] = field(default_factory=dict)  # colliders by name
