@@ -339,7 +339,7 @@ young = 8e3        # softer than the preset's 20 kPa
 
 TEXT_OF_SOFTENING = """## Why metal is soft here
 
-Real aluminium has 69 GPa and real steel 200 GPa; the preset `metal` has 5 MPa, `rubber` and `sand` are softer than most of theirs, and water is compressed ten thousand times more easily. The reason is the explicit step: a pressure wave may cross less than a cell in it, so the step is proportional to dx/√(E/ρ). A step of true steel is under a microsecond on a grid of a centimetre, some 50,000 steps a frame. A stiff body whose waves are a hundred times slower still looks rigid in a video as long as its own weight and its impacts deform it little: ρ g h ≪ E, and ρ v² ≪ E. The preset keeps the density of aluminium, so that it pushes others as it should, and its yield stress is lowered with its stiffness, so that it dents under impacts of some metres per second, as a thin can does.
+Real aluminium has 69 GPa and real steel 200 GPa; the preset `metal` has 5 MPa, `rubber` and `sand` are softer than most of theirs, and water is compressed ten thousand times more easily. The reason is the explicit step: a pressure wave may cross less than a cell in it, so the step is proportional to dx/√(E/ρ). A step of true steel is under a microsecond on a grid of a centimetre, some 60,000 steps a frame. A stiff body whose waves are a hundred times slower still looks rigid in a video as long as its own weight and its impacts deform it little: ρ g h ≪ E, and ρ v² ≪ E. The preset keeps the density of aluminium, so that it pushes others as it should, and its yield stress is lowered with its stiffness, so that it dents where the stress of an impact, ρ c v, reaches it: from about 0.7 m/s, as soft aluminium does from about 2 m/s.
 
 What this means:
 

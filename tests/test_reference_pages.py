@@ -1,7 +1,6 @@
 """The manual's pages that are written from the code are complete and up to date; what is printed is readable."""
 
 import importlib.util
-import inspect
 import json
 import re
 import sys
@@ -103,6 +102,11 @@ def test_a_material_of_arrays_or_traced_numbers_prints():
     assert re.search(r"young +traced Pa", said[0])
 
 
+def test_help_of_a_material_tells_units():
+    assert "young: Young's modulus, > 0 Pa" in pj.Material.__doc__
+    assert pj.Material.__doc__.startswith("One material")
+
+
 def test_dir_shows_the_public_names_alone():
     assert dir(pj) == sorted(pj.__all__)
 
@@ -118,7 +122,7 @@ def test_the_package_says_that_it_is_typed():
 
 def test_the_readme_of_an_index_has_no_relative_link_or_picture():
     readme = (ROOT / "README.md").read_text("utf-8")
-    hook = inspect.getmodule(reference).__spec__.loader and _module("package_readme")
+    hook = _module("package_readme")
     alone = hook.for_index(readme, "")
     assert "](docs/" not in alone
     assert "![" not in alone

@@ -100,6 +100,14 @@ def _told(value: Any) -> str:
     return f"{np.asarray(value):.6g}" if np.ndim(value) == 0 else f"array of shape {np.shape(value)}"
 
 
+# What `help` shows: the units and ranges of the numbers, which stand above once.
+Material.__doc__ = "\n".join(
+    [
+        f"{Material.__doc__}",
+        "Numbers, of which the law's must be given:",
+        *(f"    {f.name}: {LIMITS[f.name][0]}, {LIMITS[f.name][1]}" for f in fields(Parameters)),
+    ]
+)
 # Rules between the numbers of one material, by law.
 _JOINT_LIMITS = (
     (
