@@ -30,9 +30,12 @@ def _module(name):
 reference = _module("reference")
 
 
-@pytest.mark.parametrize("path", reference.pages(), ids=lambda path: path.name)
+PAGES = reference.pages()
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
 def test_pages_are_as_the_code_says(path):
-    assert path.read_text("utf-8") == reference.pages()[path], "run python .ci/reference.py"
+    assert path.read_text("utf-8") == PAGES[path], "run python .ci/reference.py"
 
 
 FILES = [reference.Scene, reference.Study, *reference.OPTIONS.values()]
