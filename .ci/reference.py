@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import math
 import re
 import sys
 from collections.abc import Iterator
@@ -84,7 +85,7 @@ def rows_of(kind: type[Section]) -> Iterator[Row]:
             meaning, _, unit = meaning[:-1].rpartition(" [")
         if kind is ObjectSpec and field.name in LIMITS and meaning.endswith(f" [{unit}]"):
             meaning = meaning.removesuffix(f" [{unit}]")
-        default = "the preset's" if kind is ObjectSpec and field.name in LIMITS else _default(field)
+        default = "of the material" if kind is ObjectSpec and field.name in LIMITS else _default(field)
         yield Row(field.name, _type(field.type), default, unit, bounds, meaning)
 
 
@@ -198,6 +199,7 @@ class Option(NamedTuple):
     name: str
     value: str
     default: str
+    range: str
     meaning: str
 
 
@@ -231,7 +233,7 @@ def _option(name: str, hint: Any, default: Any) -> Option:
         told = "**must be given**"
     if isinstance(info, ArgumentInfo):
         shown = name.upper() if default is inspect.Parameter.empty else f"[{name.upper()}]"
-        return Option(f"`{shown}`", "", told, info.help or "")
+        return Option(f"`{shown}`", "", told, "", info.help or "")
     switch = kind is bool
     declared = [text for text in (info.default, *(info.param_decls or ())) if isinstance(text, str)]
     names = tuple(part for text in declared or ["--" + name.replace("_", "-")] for part in text.split("/"))
@@ -239,8 +241,11 @@ def _option(name: str, hint: Any, default: Any) -> Option:
         told = f"`{names[0]}`" if default else ""
         names += (f"--no-{names[0][2:]}",) if not declared else ()
     value = "" if switch else info.metavar or _VALUES.get(kind, "TEXT")
+    ends = {"low": info.min, "high": info.max}
+    given = {name: end for name, end in ends.items() if end is not None}
+    bounds = _range(Limits(**{n: int(e) if kind is int else e for n, e in given.items()})) if given else ""
     return Option(f"`{', '.join(names)}`", (f"`{value}`" if value else "") + (", repeated" if listed else ""), told,
-                  info.help or "")  # fmt: skip
+                  bounds, info.help or "")  # fmt: skip
 
 
 _VALUES: dict[Any, str] = {int: "WHOLE NUMBER", float: "NUMBER", Path: "PATH"}
@@ -250,7 +255,7 @@ def commands_page() -> str:
     """docs/reference/commands.md."""
     parts = []
     for name, (usage, told, options) in commands().items():
-        table = _table(("option", "value", "default", "meaning"), [tuple(option) for option in options])
+        table = _table(("option", "value", "default", "range", "meaning"), [tuple(option) for option in options])
         lines = [f"## pigjax {name}".rstrip(), f"`{usage}`", told, table if options else "It has no options."]
         parts.append("\n\n".join(lines))
     return "\n\n".join([
@@ -277,7 +282,7 @@ REAL = {
     "foam": ("shaving foam", "60 to 100", "E 0.3 to 1 kPa", "yields at 20 to 100 Pa"),
     "cream": ("whipped cream", "400 to 500", "E 1 to 10 kPa", "yields at 50 to 150 Pa"),
     "mud": ("mud flow", "1300 to 1900", "E 1 to 100 kPa", "yields at 10 to 1000 Pa"),
-    "water": ("water at 20 °C", "998", "K 2.2 GPa", "viscosity 1.0 mPa s"),
+    "water": ("water at 20 °C", "998", "K 2.2 GPa", "viscosity 1 mPa s"),
     "oil": ("olive oil at 20 °C", "910 to 920", "K 1.6 GPa", "viscosity 80 mPa s"),
     "honey": ("honey at 20 °C", "1400 to 1450", "K about 5 GPa", "viscosity 2 to 20 Pa s"),
     "stationary": ("anything that does not move", "", "", ""),
@@ -286,8 +291,38 @@ REAL = {
 
 def _pascal(value: float) -> str:
     """As 20 kPa."""
-    power = min(3, max(0, int(np.log10(value) // 3)))
+    power = min(3, max(0, int(np.log10(abs(value)) // 3)))
     return f"{value / 1000**power:.4g} {('Pa', 'kPa', 'MPa', 'GPa')[power]}"
+
+
+# How the page tells a preset's numbers beside density and stiffness: a mark, and the unit if it is no pressure.
+OTHERS = {
+    "fibre_stiffness": ("E of fibres", "Pa"),
+    "yield_stress": ("yields at", "Pa"),
+    "hardening_modulus": ("hardening modulus", "Pa"),
+    "residual_stress": ("softens to", "Pa"),
+    "friction_angle": ("friction angle", "°"),
+    "cohesion": ("cohesion", "Pa"),
+    "viscosity": ("viscosity", "Pa s"),
+    "flow_exponent": ("exponent", ""),
+    "hardening_coefficient": ("ξ", ""),
+    "critical_compression": ("packs at", ""),
+    "critical_stretch": ("breaks at", ""),
+    "poisson": ("ν", ""),
+}
+
+
+def _others(numbers: dict[str, Any]) -> str:
+    """Numbers of a preset beside density and stiffness, as "ν 0.4, yields at 8 kPa"."""
+    told = []
+    for name in ("poisson", *(key for key in numbers if key in OTHERS and key != "poisson")):
+        if name in numbers:
+            mark, unit = OTHERS[name]
+            value = math.degrees(numbers[name]) if unit == "°" else numbers[name]
+            if unit == "Pa s" and value < 0.1:
+                value, unit = 1000 * value, "mPa s"
+            told.append(f"{mark} {_pascal(value)}" if unit == "Pa" else f"{mark} {value:.4g} {unit}".rstrip())
+    return ", ".join(told).replace(" °", "°")
 
 
 def _two_digits(value: float) -> str:
@@ -303,10 +338,10 @@ def materials_page() -> str:
                  if key in numbers]  # fmt: skip
         what, density, stiffness, more = REAL[name]
         step = _two_digits(CFL * CELL / speed * 1e6) if speed > 0 else ""
-        rows.append((f"`{name}`", what, f"{numbers['density']:.5g}", density, ", ".join(stiff), stiffness, more,
-                     _two_digits(speed) if speed > 0 else "", step))  # fmt: skip
-    head = ("preset", "real matter", "density [kg/m³]", "real", "stiffness", "real", "real, beside",
-            "pressure waves [m/s]", "step [µs]")  # fmt: skip
+        rows.append((f"`{name}`", what, f"{numbers['density']:.5g}", density, ", ".join(stiff), stiffness,
+                     _others(numbers), more, _two_digits(speed) if speed > 0 else "", step))  # fmt: skip
+    head = ("preset", "real matter", "density [kg/m³]", "real density", "stiffness", "real stiffness", "other numbers",
+            "real ones", "pressure waves [m/s]", "step [µs]")  # fmt: skip
     laws = [(f"`{name}`", ", ".join(f"`{n}`" for n in ("density", *law.needs)),
              ", ".join(f"`{key}`" for key, numbers in PRESETS.items() if numbers["model"] == name))
             for name, law in LAWS.items()]  # fmt: skip
@@ -319,15 +354,15 @@ def materials_page() -> str:
         "# Materials", NOTE, TEXT_OF_MATERIALS, "## Presets beside real matter",
         _table(head, rows),
         f"The last column is the longest explicit step on a grid of {100 * CELL:g} cm at `cfl` {CFL:g}, of matter that "
-        "moves slowly: cfl · dx / c. Real numbers are common ranges of handbooks; matter of one name differs by more "
-        "than that.",
+        "moves slowly: cfl · dx / c, with the speed c of pressure waves. Real numbers are common ranges of handbooks; "
+        "matter of one name may differ by more than that.",
         TEXT_OF_SOFTENING, "## Laws", "The stress and the flow rule of each are in [MPM.md](MPM.md).",
         _table(("`model`", "numbers that it needs", "presets"), laws), "## Numbers",
         _table(("field", "unit", "range", "meaning"), numbers),
     ]) + "\n"  # fmt: skip
 
 
-TEXT_OF_MATERIALS = """A material is a law with its numbers in SI units. A preset is one by its everyday name, and its numbers can be replaced one by one:
+TEXT_OF_MATERIALS = """A material is a law with its numbers, in SI units. A preset is a material with an everyday name; its numbers can be replaced one by one:
 
 ```toml
 [objects.duck]
@@ -339,13 +374,13 @@ young = 8e3        # softer than the preset's 20 kPa
 
 TEXT_OF_SOFTENING = """## Why metal is soft here
 
-Real aluminium has 69 GPa and real steel 200 GPa; the preset `metal` has 5 MPa, `rubber` and `sand` are softer than most of theirs, and water is compressed ten thousand times more easily. The reason is the explicit step: a pressure wave may cross less than a cell in it, so the step is proportional to dx/√(E/ρ). A step of true steel is under a microsecond on a grid of a centimetre, some 60,000 steps a frame. A stiff body whose waves are a hundred times slower still looks rigid in a video as long as its own weight and its impacts deform it little: ρ g h ≪ E, and ρ v² ≪ E. The preset keeps the density of aluminium, so that it pushes others as it should, and its yield stress is lowered with its stiffness, so that it dents where the stress of an impact, ρ c v, reaches it: from about 0.7 m/s, as soft aluminium does from about 2 m/s.
+Real aluminium has 69 GPa and real steel 200 GPa; the preset `metal` has 5 MPa. `rubber` and `sand` are softer than most real ones, and `water` is compressed ten thousand times more easily. The reason is the explicit step: a pressure wave may cross less than a cell in it, so the step is proportional to dx / √(E/ρ). A step of real steel is under a microsecond on a grid of a centimetre, which makes some 60,000 steps a frame. A stiff body whose waves are a hundred times slower still looks rigid in a video, as long as its own weight and its impacts deform it little: ρ g h ≪ E and ρ v² ≪ E. The preset keeps the density of aluminium, so that it pushes others as aluminium does. Its yield stress is lowered with its stiffness: it dents where the stress of an impact, ρ c v, reaches 100 kPa, from about 0.7 m/s; soft aluminium dents from about 2 m/s.
 
 What this means:
 
-- Shapes, weight, friction, flow and contact are those of the named matter. The pitch of vibrations, the time of an impact and the depth of a dent in `metal` are not: do not read forces or stresses of a real part from it.
+- Weight, friction, flow and shape at rest are those of the named matter. The pitch of vibrations, the duration of an impact and the depth of a dent in `metal` are not: it does not tell forces or stresses of a real part.
 - `steel` and `stone` keep the real moduli. They need `simulation.integrator = "implicit"` or slow motion. An object that need not deform is cheaper as `fixed = true`, or as a collider with a velocity.
-- Water's `bulk_modulus` only has to keep it from being squeezed visibly: waves should be ten times as fast as the flow (Monaghan 1994). The preset's 14 m/s do for splashes of up to about 1.5 m/s, that is falls of 10 cm; raise it with the square of the speed for higher ones.
+- The `bulk_modulus` of water only has to keep it from being squeezed visibly: waves should be ten times as fast as the flow (Monaghan 1994). The preset's 14 m/s serve flows of up to about 1.4 m/s, that is falls of 10 cm. For higher falls raise it with the square of the speed.
 - To fit numbers to a real object, tune them against its video: [studies](STUDIES.md). Only E/ρ can be seen in a video without known forces."""  # noqa: E501
 
 

@@ -33,7 +33,7 @@ class ForceSpec(Section, frozen=True, kw_only=True):
     own_fields: ClassVar[frozenset[str]] = frozenset({"kind", "objects", "region"})  # that are no numbers of the force
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
-        """It ends after it begins."""
+        """It ends after it begins, and acts on one object or more."""
         ordered = self.start is None or self.end is None or self.start <= self.end
         yield "end", ordered, f"it must not be before start = {self.start} s"
         yield "objects", self.objects is None or len(self.objects) > 0, "name one or more, or leave it out for all"
@@ -77,11 +77,12 @@ class WindSpec(ForceSpec, frozen=True, kw_only=True):
 
     kind: Literal["wind"]  # which force it is
     velocity: Annotated[_Triple, _SPEED]  # of the air
-    drag: Annotated[float, Limits(0, 1e9, unit="1/s")] = 2.0  # rate at which matter takes the wind's velocity
+    # rate at which matter takes the wind's velocity; 1 to 10: leaves
+    drag: Annotated[float, Limits(0, 1e9, unit="1/s")] = 2.0
     quadratic_drag: Annotated[float, Limits(0, 1e9, unit="1/m")] | None = None  # the same per speed; None: 0
     gusts: Annotated[float, Limits(0, 1e6, unit="m/s")] | None = None  # root mean square of their speed; None: steady
-    gust_size: Annotated[float, Limits(0, 1e9, above=True, unit="m")] = 1.0  # length of their longest wave
-    seed: Annotated[int, Limits(0, LARGEST_WHOLE)] = 0  # of the gusts
+    gust_size: Annotated[float, Limits(0, 1e9, above=True, unit="m")] = 1.0  # length of their longest wave; 1: a room's
+    seed: Annotated[int, Limits(0, LARGEST_WHOLE)] = 0  # of the gusts' waves
     force = Wind
 
 
@@ -89,21 +90,21 @@ class FieldSpec(ForceSpec, frozen=True, kw_only=True):
     """An acceleration that is uniform or linear in space; see `ForceField`."""
 
     kind: Literal["field"]  # which force it is
-    acceleration: Annotated[_Triple, Limits(-1e9, 1e9, unit="m/s²")] = (0.0, 0.0, 0.0)  # at the centre
-    # by row the derivatives of one component
+    acceleration: Annotated[_Triple, Limits(-1e9, 1e9, unit="m/s²")] = (0.0, 0.0, 0.0)  # at `centre`
+    # its derivatives: row i holds those of component i along x, y, z; None: the acceleration is uniform
     gradient: Annotated[tuple[_Triple, _Triple, _Triple], Limits(-1e9, 1e9, unit="1/s²")] | None = None
     centre: Annotated[_Triple, _PLACE] | None = None  # where the acceleration is as given; None: the origin
     force = ForceField
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
-        """It does something."""
+        """It has an acceleration or a gradient, and it ends after it begins."""
         yield from super().rules()
         given = any(self.acceleration) or self.gradient is not None
         yield "acceleration", given, "give it, or a gradient: a field without either does nothing"
 
 
 class ImpulseSpec(ForceSpec, frozen=True, kw_only=True):
-    """A blow, shared by mass; see `Impulse`."""
+    """A blow that gives all of the matter one change of velocity; see `Impulse`."""
 
     kind: Literal["impulse"]  # which force it is
     momentum: Annotated[_Triple, Limits(-1e9, 1e9, unit="N s")]  # that matter receives in all

@@ -41,14 +41,16 @@ INPUT_FILES = ("gaussians", "views", "images", "masks", "labels", "names")  # fi
 class InputSpec(Section, frozen=True):
     """Where the scene comes from; paths are relative to the scene file."""
 
-    gaussians: str  # trained .ply
+    gaussians: str  # trained splats: .ply, .splat, .sog or .glb; .spz (extra formats); USD (extra usd)
     views: str | None = None  # posed photos, which the masks belong to
     images: str | None = None  # folder of the photos, where it is not the one that the cameras' file names
     masks: str | None = None  # folder of instance masks; None: `object_mask` beside the photos
     labels: str | None = None  # labels.npz of `pigjax segment`, instead of masks
-    names: str | None = None  # JSON of mask ids and names
-    max_size: Annotated[int, Limits(1, 65536, unit="px")] | None = None  # of the photos' longer side
-    drop_invalid: bool = False  # leave out Gaussians with NaN or infinity instead of refusing the file
+    names: str | None = None  # JSON of mask ids and names; None: objects need an `id`
+    # of the longer side of photos, which shrink to it; None: as they are
+    max_size: Annotated[int, Limits(1, 65536, unit="px")] | None = None
+    # leave out Gaussians with NaN or infinity; by default the file is refused, since it may be damaged
+    drop_invalid: bool = False
     origin: Triple | None = None  # subtracted from Gaussians and cameras in float64, for georeferenced files [m]
     # axis or direction of the world that points up; nothing is turned (`world.up` turns)
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | Triple = "z"
@@ -65,12 +67,14 @@ class SegmentationSpec(Section, frozen=True):
 
     # the surface of a pixel is where the transmittance falls below it; the paper's value
     tau_T: Annotated[float, Limits(0, 1)] = 0.5
-    # a Gaussian on the surface differs from its depth by at most this share; inside a broad plateau of scores
+    # a Gaussian on the surface differs from its depth by at most this share; in the middle of a broad range of values
+    # that score alike
     tau_d: Annotated[float, Limits(0, 1)] = 0.03
     # "vote": pixels without an object vote for the background; by default they say nothing, since masks are often
     # incomplete
     background: Literal["ignore", "vote"] = "ignore"
-    fill_unseen: bool = True  # unseen Gaussians take the id of their neighbours
+    # Gaussians that no view saw take the id of their neighbours: most lie inside of objects, and move with them
+    fill_unseen: bool = True
 
 
 class SimulationSpec(Section, frozen=True):
@@ -81,17 +85,18 @@ class SimulationSpec(Section, frozen=True):
     frames: Annotated[int, Limits(1, 100_000)] = 48  # of the video; 48 are two seconds
     # frames of the video in a second; that of films
     fps: Annotated[float, Limits(0, 1e4, above=True, unit="1/s")] = 24.0
-    gravity: Annotated[float | Triple, Limits(-1e6, 1e6, unit="m/s²")] = 9.81  # downwards, or a vector
+    gravity: Annotated[float | Triple, Limits(-1e6, 1e6, unit="m/s²")] = 9.81  # downwards, or a vector; Earth's
     slow_motion: Annotated[float, Limits(0, 1e9, above=True)] = 1.0  # simulated time is shown this many times slower
     # matter that fills a cell of the grid: 2 along each axis, with which no gaps open as it stretches a little
     particles_per_cell: Annotated[float, Limits(0, 1e4, above=True)] = 8.0
-    fill: bool = True  # fill objects inside
+    fill: bool = True  # fill objects with particles inside, where a capture is hollow
     # largest part of a cell that waves and matter cross in one step; 0.4 leaves room for matter that stiffens when
     # pressed
     cfl: Annotated[float, Limits(0, 1, above=True)] = 0.4
-    # B-spline between particles and grid; "cubic" is smoother and dearer
+    # B-spline between particles and grid: "quadratic" has 27 nodes for each particle, "cubic" 64 and is smoother
     kernel: Literal["quadratic", "cubic"] = "quadratic"
-    # "implicit" takes steps of a frame or so, for matter stiffer than about 1e8 Pa; "auto" chooses by the cost
+    # "explicit" takes many cheap steps, "implicit" steps of a frame or so, for matter stiffer than about 1e8 Pa;
+    # "auto" chooses by the cost
     integrator: Literal["explicit", "implicit", "auto"] = "explicit"
     # of objects on each other, which then never fuse; None: one common field
     contact_friction: Annotated[float, _FRICTION] | None = None
@@ -107,9 +112,10 @@ class ClampSpec(Section, frozen=True):
     # "fixed" keeps shapes at rest
     mode: Literal["aligned", "literal", "covariance", "fixed"] = "aligned"
     tau_min: Annotated[float, Limits(0, 1e9)] = 0.5  # lower bound of a splat's scales; with the default they may halve
-    # upper bound of a splat's scales; with the default they may double, which ends before needles show
+    # upper bound of a splat's scales; with the default they may double, and needles hardly show
     tau_max: Annotated[float, Limits(0, 1e9, above=True)] = 2.0
     # how far axes go from those at rest, turned as the matter, towards those of the deformed splat (1); the paper's
+    # value
     lambda_R: Annotated[float, _WEIGHT] = 1.2
     lambda_S: Annotated[float, _WEIGHT] = 0.8  # how far scales follow within their bounds; the paper's value
     relative: bool = True  # bounds are shares of each splat's own scale at rest; false: lengths in m
@@ -129,13 +135,15 @@ class CameraSpec(Section, frozen=True):
     view: str | None = None  # name of a photo whose camera is taken
     target: Annotated[Triple, _PLACE] | None = None  # centre of the orbit; None: middle of the moving objects
     radius: Annotated[float, _LENGTH] | None = None  # of the orbit; None: twice the median distance of the scene's core
-    elevation: Annotated[float, Limits(-90, 90, unit="degrees")] = 30.0  # of an orbit, above the horizon
-    start: Annotated[float, _ANGLE] = 0.0  # azimuth of the first frame
-    sweep: Annotated[float, _ANGLE] = 0.0  # azimuth covered by the video
-    field_of_view: Annotated[float, Limits(0, 180, above=True, below=True, unit="degrees")] = 45.0  # horizontal
-    width: Annotated[int, _PIXELS] = 512  # of the video
+    # of an orbit, above the horizon; 30: looks down a little
+    elevation: Annotated[float, Limits(-90, 90, unit="degrees")] = 30.0
+    start: Annotated[float, _ANGLE] = 0.0  # azimuth of the first frame, about up
+    sweep: Annotated[float, _ANGLE] = 0.0  # azimuth covered by the video; 0: the camera is still
+    # horizontal; 45 is that of a normal lens
+    field_of_view: Annotated[float, Limits(0, 180, above=True, below=True, unit="degrees")] = 45.0
+    width: Annotated[int, _PIXELS] = 512  # of the video; time of drawing grows with width times height
     height: Annotated[int, _PIXELS] = 512  # of the video
-    background: Annotated[float | Triple, Limits(0, 1)] = 0.0  # grey, or red, green and blue, behind all splats
+    background: Annotated[float | Triple, Limits(0, 1)] = 0.0  # grey, or red, green and blue, behind all splats; black
 
     @property
     def is_open(self) -> bool:
@@ -155,9 +163,11 @@ class DrawingSpec(Section, frozen=True):
     # of the video's width and height: 0.5 draws a quarter of the pixels
     scale: Annotated[float, Limits(0, 16, above=True)] = 1.0
     sh_degree: Annotated[int, Limits(0, 3)] | None = None  # bands of view-dependent colour; None: all
-    # fainter contributions are skipped; the bound is the opacity that no splat exceeds
+    # fainter contributions are skipped: 1/255, the smallest step of 8-bit colours, as 3DGS; the bound is the opacity
+    # that no splat exceeds
     alpha_min: Annotated[float, Limits(0, RenderConfig.alpha_max, below=True)] = 1 / 255
-    transmittance_min: Annotated[float, Limits(0, 1, below=True)] = 1e-4  # a pixel is closed before it falls below
+    # a pixel is closed before it falls below, as in 3DGS
+    transmittance_min: Annotated[float, Limits(0, 1, below=True)] = 1e-4
 
 
 class OutputSpec(Section, frozen=True):
@@ -165,8 +175,11 @@ class OutputSpec(Section, frozen=True):
 
     # frames from one kept state to the next, the last frame's beside them; 0: none, and a killed run begins again
     states_every: Annotated[int, Limits(0, 100_000)] = 1
-    compress_states: bool = False  # deformation and velocity in half precision, deflated: half the size
-    # first frames that are simulated once more on a grid of 1.5 times the spacing, for the report's `estimated_error`
+    # deformation and velocity in half precision, deflated: half the size; splats that are posed again differ by
+    # the rounding
+    compress_states: bool = False
+    # first frames that are simulated once more on a grid of 1.5 times the spacing, for the report's `estimated_error`;
+    # 0: none
     error_frames: Annotated[int, Limits(0, 100_000)] = 0
 
 
@@ -180,7 +193,8 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     id: Annotated[int, Limits(0, 2**31 - 1)] | None = None
     gaussians: str | None = None  # file of its own, placed into the scene as the fields below say
     within: RegionSpec | None = None  # Gaussians with their centres here are its own, whatever masks and labels say
-    # outliers, which never become matter: "parts" cuts what lies apart from it, "largest" all but its largest part
+    # outliers, which never become matter: "parts" cuts what lies apart from it, "largest" all but its largest part,
+    # "all" nothing
     keep: Literal["parts", "largest", "all"] = "parts"
     height: str | None = None  # its true height with a unit, as "0.6 m": gives the scale of the whole scene
     offset: Annotated[Triple, _PLACE] = (0.0, 0.0, 0.0)  # from where its Gaussians are
@@ -189,12 +203,12 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     copies: Annotated[list[Triple], _PLACE] = field(default_factory=list)  # offsets of more of it, each its own object
     removed: bool = False  # its splats are left out, as if it had never stood there
     fixed: bool = False  # a still collider made from its own splats
-    friction: Annotated[float, _FRICTION] = 0.5  # Coulomb's coefficient of a fixed object
+    friction: Annotated[float, _FRICTION] = 0.5  # Coulomb's coefficient of a fixed object; that of many dry pairs
     material: str | None = None  # name of a preset; its numbers may be replaced by the fields below
     model: str | None = None  # name of a law, instead of a preset; its numbers follow
     velocity: Annotated[Triple, _SPEED] = (0.0, 0.0, 0.0)  # at its start
     angular_velocity: Annotated[Triple, Limits(-1e6, 1e6, unit="rad/s")] = (0.0, 0.0, 0.0)  # about its centre of mass
-    start: Annotated[float, Limits(0, 1e6, unit="s")] = 0.0  # simulated time until which it stands still, as a rock
+    start: Annotated[float, Limits(0, 1e6, unit="s")] = 0.0  # simulated time until which it is held rigid and still
     density: Annotated[float, Limits(unit="kg/m³")] | None = None
     young: Annotated[float, Limits(unit="Pa")] | None = None
     poisson: Annotated[float, Limits()] | None = None
@@ -353,7 +367,7 @@ class Scene(Section, frozen=True):
     folder: str = "."  # set by `load_scene`; the base of relative paths
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
-        """Something moves, objects can be told apart, contact has its integrator, and pictures have a size."""
+        """Something moves, objects can be told apart, one length gives the scale; forces, integrator and size fit."""
         moving = sum(spec.moves for spec in self.objects.values())
         yield "objects", moving > 0, "none moves; give one a material"
         owners: dict[int, str] = {}

@@ -28,8 +28,8 @@ class ParameterSpec(Section, frozen=True):
 
     values: list[Value] | None = None  # of a sweep; None: `count` of them from low to high
     low: Value | None = None  # bounds of a search, or ends of a sweep; one for all components, or one each
-    high: Value | None = None  # as low
-    count: Annotated[int, Limits(1, MOST_ROWS)] = 5  # of a sweep from low to high
+    high: Value | None = None  # the other bound or end
+    count: Annotated[int, Limits(1, MOST_ROWS)] = 5  # number of values of a sweep from low to high
     # "log": values of a sweep have equal ratios, and steps of a search multiply
     scale: Literal["linear", "log"] = "linear"
     start: Value | None = None  # of a search; None: the scene's own value
@@ -75,18 +75,20 @@ class SweepSpec(Section, frozen=True):
 
     join: Literal["grid", "rows"] = "grid"  # all combinations, or the k-th value of each together
     batch: Annotated[int, Limits(1, MOST_ROWS)] | None = None  # rows at once; None: as many as memory holds
-    best: Literal["min", "max"] = "min"  # which end of the result is the best
-    of: str = "loss"  # the result that is judged and drawn
+    best: Literal["min", "max"] = "min"  # whether the least or the greatest result is the best
+    of: str = "loss"  # name of the result that is judged and drawn, a column of the table
 
 
 class TuneSpec(Section, frozen=True):
     """The search for the least loss."""
 
-    method: Literal["adam", "cma"] = "adam"  # by gradients, or without
-    rate: Annotated[float, Limits(0, 1e3, above=True)] = 0.05  # of Adam, in the unit of the bounds' transform
-    steps: Annotated[int, Limits(1, 10_000_000)] = 100  # of Adam, or losses evaluated without gradients
-    clip: Annotated[float, Limits(0, above=True)] | None = None  # largest norm of a gradient
-    patience: Annotated[int, Limits(1, LARGEST_WHOLE)] | None = None  # steps without a better loss before it stops
+    method: Literal["adam", "cma"] = "adam"  # "adam" follows gradients, "cma" needs none (pip install '.[search]')
+    # step of Adam on the number behind the sigmoid of its bounds; 0.05 moves one that is midway by 1 % of their range
+    rate: Annotated[float, Limits(0, 1e3, above=True)] = 0.05
+    steps: Annotated[int, Limits(1, 10_000_000)] = 100  # of Adam, or evaluations of the loss by cma
+    clip: Annotated[float, Limits(0, above=True)] | None = None  # largest norm of a gradient; None: not limited
+    # steps without a better loss before it stops; None: all `steps` are taken
+    patience: Annotated[int, Limits(1, LARGEST_WHOLE)] | None = None
     # of Adam from its best with half the rate, after `patience` steps without a better loss
     restarts: Annotated[int, Limits(0, 10_000)] = 0
     seed: Annotated[int, Limits(0, LARGEST_WHOLE)] = 0  # of the samples of cma
