@@ -31,11 +31,11 @@ from pigjax.core.checks import Limits  # noqa: E402
 from pigjax.mpm.materials import LAWS, PRESETS, Parameters, material_table, preset  # noqa: E402
 from pigjax.mpm.materials.table import LIMITS  # noqa: E402
 from pigjax.scene.decode import Section, numbers_of, sections_of, wanted  # noqa: E402
-from pigjax.scene.schema import ObjectSpec, Scene  # noqa: E402
+from pigjax.scene.schema import ObjectSpec, Scene, SimulationSpec  # noqa: E402
 from pigjax.study.schema import OPTIONS, Study  # noqa: E402
 
 FROM_OUTSIDE = {"folder"}  # set by the reader of a file, and not a field of it
-CELL, CFL = 0.01, 0.4  # of the steps on the page of materials [m], [-]
+CELL, CFL = 0.01, SimulationSpec().cfl  # of the steps on the page of materials [m], [-]
 
 
 class Row(NamedTuple):
@@ -374,7 +374,7 @@ young = 8e3        # softer than the preset's 20 kPa
 
 TEXT_OF_SOFTENING = """## Why metal is soft here
 
-Real aluminium has 69 GPa and real steel 200 GPa; the preset `metal` has 5 MPa. `rubber` and `sand` are softer than most real ones, and `water` is compressed ten thousand times more easily. The reason is the explicit step: a pressure wave may cross less than a cell in it, so the step is proportional to dx / √(E/ρ). A step of real steel is under a microsecond on a grid of a centimetre, which makes some 60,000 steps a frame. A stiff body whose waves are a hundred times slower still looks rigid in a video, as long as its own weight and its impacts deform it little: ρ g h ≪ E and ρ v² ≪ E. The preset keeps the density of aluminium, so that it pushes others as aluminium does. Its yield stress is lowered with its stiffness: it dents where the stress of an impact, ρ c v, reaches 100 kPa, from about 0.7 m/s; soft aluminium dents from about 2 m/s.
+Real aluminium has 69 GPa and real steel 200 GPa; the preset `metal` has 5 MPa. `rubber` and `sand` are softer than most real ones, and `water` is compressed ten thousand times more easily. The reason is the explicit step: a pressure wave may cross less than a cell in it, so the step is proportional to dx / √(E/ρ). A step of real steel is a microsecond on a grid of a centimetre, which makes some 40,000 steps a frame. A stiff body whose waves are a hundred times slower still looks rigid in a video, as long as its own weight and its impacts deform it little: ρ g h ≪ E and ρ v² ≪ E. The preset keeps the density of aluminium, so that it pushes others as aluminium does. Its yield stress is lowered with its stiffness: it dents where the stress of an impact, ρ c v, reaches 100 kPa, from about 0.7 m/s; soft aluminium dents from about 2 m/s.
 
 What this means:
 

@@ -356,7 +356,9 @@ def _still_solids(scene: Scene, inputs: Inputs, labels: Labels, dx: float) -> di
     for name, entry in scene.objects.items():
         if entry.fixed:
             members = np.flatnonzero(object_id == inputs.ids[name])
-            own = jax.tree.map(lambda values, members=members: values[members], inputs.gaussians)
+            own = jax.tree.map(
+                lambda values, members=members: jnp.asarray(np.asarray(values)[members]), inputs.gaussians
+            )
             solids[name] = collider_from_gaussians(
                 own,
                 spacing=dx / 2,
@@ -393,8 +395,9 @@ def _without_buried(inputs: Inputs, labels: Labels, solids: dict[str, Collider],
     a collider could only be stuck.
     """
     for name, solid in solids.items():
-        buried = solid.distance(inputs.gaussians.means) < -0.25 * dx
-        labels = replace(labels, object_id=jnp.where(buried, inputs.ids[name], labels.object_id))
+        buried = solid.distances_of(inputs.gaussians.means) < -0.25 * dx
+        object_id = np.where(buried, inputs.ids[name], np.asarray(labels.object_id))
+        labels = replace(labels, object_id=jnp.asarray(object_id, jnp.int32))
     return labels
 
 
