@@ -25,6 +25,7 @@ NUMBERS = {  # in the order of LAWS, what each law reads
     "neo_hookean": set(),
     "stvk_hencky": set(),
     "fibres": {"fibre_stiffness", "fibre_azimuth", "fibre_elevation"},
+    "tearing_neo_hookean": {"tearing_stretch"},
     "von_mises": {"yield_stress", "hardening_modulus", "residual_stress"},
     "plasticine": {"yield_stress", "hardening_modulus", "residual_stress"},
     "drucker_prager": {"friction_angle", "cohesion"},
@@ -37,6 +38,7 @@ FLOOR = {"point": jnp.asarray([0.0, 0.0, 0.4]), "normal": jnp.asarray([0.0, 0.0,
 
 def material(law, **numbers):
     given = {"yield_stress": 1e3, "friction_angle": 0.6, "viscosity": 1.0, "bulk_modulus": 1e4, "fibre_stiffness": 1e4}
+    given["tearing_stretch"] = 1.2
     own = {name: given[name] for name in NUMBERS[law] if name in given}
     return Material(law, **{**ELASTIC, **own, **numbers})
 
@@ -142,7 +144,9 @@ SIGNS = {
     "fluid": (lambda: traced([material("fluid")]), lambda p: primitives(p)["cbrt"] > 0),
     "drucker_prager": (lambda: traced([material("drucker_prager")]), lambda p: primitives(p)["tan"] > 0),
     "von_mises": (lambda: traced([material("von_mises")]), lambda p: primitives(p)["exp"] > 0),
+    "tearing": (lambda: traced([material("tearing_neo_hookean")]), lambda p: in_steps(p)["clamp"] > 0),
     "foam": (lambda: traced([material("foam")]), lambda p: primitives(p)["pow"] > 0),
+    "rigid bodies": (lambda: traced([Material("rigid", density=1e3)]), lambda p: primitives(p)["lu"] > 0),
     "gusts": (lambda: traced(forces=(Wind((1.0, 0, 0), 1.0, gusts=1.0),)), lambda p: primitives(p)["cos"] > 0),
 }
 

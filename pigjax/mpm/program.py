@@ -140,6 +140,7 @@ def run_frames(
         unit_mass=lax.stop_gradient(jnp.where(jnp.isfinite(particles.mass), particles.mass, 0).max()),
         opaque_true=everywhere(~(particles.volume0[0] < -jnp.finfo(dtype).max)),  # true of NaN too
         forces=without_weights(inputs.forces),
+        rigid=_rigid_bodies(particles, table, bodies),
     )
     statics = StepStatics(
         kernel=kernel,
@@ -310,6 +311,15 @@ def _held_nodes(
         inside = region.contains(points)
         touched = inside if touched is None else touched | inside
     return touched
+
+
+def _rigid_bodies(particles: Particles, table: MaterialTable, bodies: int) -> Bool[Array, "b"] | None:
+    """Which bodies have rigid matter; None where there is none. Without contact between bodies all matter is one."""
+    rows = np.array([law == "rigid" for law in table.laws])
+    if not any(count for count, own in zip(particles.counts, rows) if own):
+        return None
+    own = jnp.asarray(rows)[particles.material].astype(int)
+    return jax.ops.segment_max(own, particles.body if bodies > 1 else 0 * particles.body, bodies) > 0
 
 
 def _specific_volume(particles: Particles, bodies: int) -> Float[Array, "b"]:

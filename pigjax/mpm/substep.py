@@ -23,11 +23,12 @@ from pigjax.mpm import WALL, Grid, State, StepHealth
 from pigjax.mpm.by_law import by_component, by_row
 from pigjax.mpm.chunked import ChunkLoop, gather_chunks, scatter_chunks
 from pigjax.mpm.colliders import Collider, Contact, Press, Time
-from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.contact import BodyContact, Faces, faces
 from pigjax.mpm.forces import Force, Matter
 from pigjax.mpm.health import LaneHealth
 from pigjax.mpm.materials import Parameters, respond
 from pigjax.mpm.materials.tensors import determinant, product
+from pigjax.mpm.rigid import rigid_velocities
 from pigjax.mpm.transfers import (
     CHANNELS,
     Kernel,
@@ -84,6 +85,7 @@ class StepContext(NamedTuple):
     unit_mass: Float[Array, ""]  # of the heaviest particle [kg]
     opaque_true: Bool[Array, ""]  # for `transfers.no_fuse`
     forces: tuple[Force, ...] = ()  # beside gravity; particles carry their weights
+    rigid: Bool[Array, "b"] | None = None  # which bodies are rigid; None: none is
 
     @property
     def bodies(self) -> int:
@@ -171,7 +173,9 @@ def update_grid(
     with jax.named_scope("update_grid"):
         if statics.solve_balance is not None:
             return statics.solve_balance(statics, context, states, nodes, time)
-        _, velocity = free_velocity(context, nodes)
+        filled, velocity = free_velocity(context, nodes)
+        if context.rigid is not None:
+            return _rigid_step(statics, context, states, nodes, filled, velocity, time), True
         if context.body_contact is not None:
             velocity = _separate_bodies(statics, context, states, nodes, velocity)
         return apply_boundaries(statics, context, velocity, time=time), True
@@ -460,8 +464,16 @@ def _separate_bodies(
     nodes: Float[Array, "n y z 4"],
     velocity: Float[Array, "b x y z 3"],
 ) -> Float[Array, "b x y z 3"]:
-    """Velocities after contact between bodies. P2G brings the place of their matter to the grid as it does momentum."""
+    """Velocities after contact between bodies."""
     assert context.body_contact is not None
+    mass = nodes.reshape(context.bodies, *context.grid.shape, 4)[..., :1] / context.unit_mass
+    return context.body_contact.collide(velocity, mass, _faces(statics, context, states, nodes))
+
+
+def _faces(
+    statics: StepStatics, context: StepContext, states: tuple[State, ...], nodes: Float[Array, "n y z 4"]
+) -> Faces:
+    """Where bodies touch. P2G brings the place of their matter to the grid as it does momentum."""
     assert context.specific_volume is not None
     width = context.grid.shape[0]
 
@@ -472,11 +484,47 @@ def _separate_bodies(
 
     moment = particles_to_grid(statics, context, tuple(map(moments, states)))
     apart = (context.bodies, *context.grid.shape, 4)
-    mass = nodes.reshape(apart)[..., :1]
     specific = context.specific_volume[:, None, None, None, None]
-    return context.body_contact.part(
-        velocity, mass / context.unit_mass, specific * mass, specific * moment.reshape(apart)[..., 1:]
-    )
+    return faces(specific * nodes.reshape(apart)[..., :1], specific * moment.reshape(apart)[..., 1:])
+
+
+def _rigid_step(
+    statics: StepStatics,
+    context: StepContext,
+    states: tuple[State, ...],
+    nodes: Float[Array, "n y z 4"],
+    filled: Bool[Array, "*b x y z 1"],
+    velocity: Float[Array, "*b x y z 3"],
+    time: Time,
+) -> Float[Array, "n y z 3"]:
+    """Velocities of the nodes where some bodies are rigid, after contact, colliders and walls."""
+    assert context.rigid is not None
+    apart = (context.bodies, *context.grid.shape)
+    filled, velocity = filled.reshape(*apart, 1), velocity.reshape(*apart, 3)
+    mass = jnp.where(filled, nodes.reshape(*apart, 4)[..., :1] / context.unit_mass, 0.0)
+    found = [
+        collider.contact(context.grid.points, time) if contact is None else contact
+        for collider, contact in zip(context.colliders, context.collider_contacts)
+    ]
+    context = context._replace(collider_contacts=tuple(found))
+    walls = apply_walls(jnp.ones((*apart[1:], 3), mass.dtype), statics.walls, context.low, context.domain)
+    walls = walls * apply_walls(-walls, statics.walls, context.low, context.domain)
+    touched = (walls == 0).any(-1)
+    touched = touched if context.frozen is None else touched | context.frozen
+    for contact in found:
+        touched = touched | (contact.inside > 0)
+    meets = filled & touched[..., None]
+    between = None if context.body_contact is None else _faces(statics, context, states, nodes)
+    if between is not None:
+        meets = meets | (filled & between.near)
+
+    def resolve(velocity, mass):
+        if context.body_contact is not None:
+            velocity = context.body_contact.collide(velocity, mass, between)
+        return apply_boundaries(statics, context, velocity, time=time).reshape(velocity.shape)
+
+    cells = context.dt / context.grid.dx
+    return rigid_velocities(context.rigid, mass, velocity, meets, resolve, cells).reshape(*context.nodes, 3)
 
 
 def apply_boundaries(
