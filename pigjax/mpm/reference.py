@@ -1,7 +1,7 @@
 """Plain MLS-MPM on dense arrays: the stages of `substep`, to read and to test the fast path against.
 
 No chunks, window, devices or derivative rules: equations as in the `mls_mpm` docstring, one line each. It covers
-explicit steps of every law with colliders and walls, and no contact between bodies.
+explicit steps of every law but "rigid" with colliders and walls, and no contact between bodies.
 """
 
 from __future__ import annotations

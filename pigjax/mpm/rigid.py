@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from pigjax.core.linalg import safe_norm
+from pigjax.core.linalg import inv3, matmul3, safe_norm
 
 _ROUNDS = 20  # of contact; a box that lies on a floor keeps 1 % of its tilting speed, and 1e-4 of its falling speed
 _RELAXATION = 1.4  # over the Frobenius norm of the answer, whose largest eigenvalue comes twice: no body overshoots
@@ -33,6 +33,7 @@ class Bodies(NamedTuple):
     arms: Velocities  # of the nodes
     second: Float[Array, "b 3 3"]  # Σ m r rᵀ
     inertia: Float[Array, "b 3 3"]
+    mobility: Float[Array, "b 3 3"]  # inverse of the inertia
 
     @classmethod
     def of(cls, mass: Masses) -> Bodies:
@@ -44,9 +45,8 @@ class Bodies(NamedTuple):
         middle = (mass * nodes).sum((1, 2, 3)) / jnp.where(some, total, 1.0)[:, None]
         arms = nodes - middle[:, None, None, None]
         second = moments(mass * arms, arms)
-        eye = jnp.eye(3, dtype=mass.dtype)
-        inertia = jnp.trace(second, axis1=1, axis2=2)[:, None, None] * eye - second
-        return cls(jnp.where(some, total, 1.0), arms, second, jnp.where(some[:, None, None], inertia, eye))
+        inertia = jnp.where(some[:, None, None], _turned(second), jnp.eye(3, dtype=mass.dtype))
+        return cls(jnp.where(some, total, 1.0), arms, second, inertia, inv3(inertia))
 
     def field(self, velocity: Float[Array, "b 3"], spin: Float[Array, "b 3"]) -> Velocities:
         """Velocities of the nodes of bodies that move [m/s] and turn [m/s per cell]."""
@@ -55,21 +55,16 @@ class Bodies(NamedTuple):
     def motion(self, momentum: Velocities) -> tuple[Float[Array, "b 3"], Float[Array, "b 3"]]:
         """Velocity [m/s] and spin [m/s per cell] that the momenta of the nodes give to the bodies."""
         angular = jnp.cross(self.arms, momentum).sum((1, 2, 3))
-        spin = jnp.linalg.solve(self.inertia, angular[..., None])[..., 0]
-        return momentum.sum((1, 2, 3)) / self.mass[:, None], spin
+        return momentum.sum((1, 2, 3)) / self.mass[:, None], _times(self.mobility, angular)
 
     def response(self, touched: Masses) -> Float[Array, "b"]:
         """Frobenius norm of the bodies' answer to contact at nodes of these masses, over the stop of all of them."""
         arm = (touched * self.arms).sum((1, 2, 3))
-        second = moments(touched * self.arms, self.arms)
-        eye = jnp.eye(3, dtype=touched.dtype)
-        own = jnp.linalg.inv(self.inertia)
-        spread = jnp.trace(second, axis1=1, axis2=2)[:, None, None] * eye - second
-        turning = own @ spread
-        crossed = (arm**2).sum(1)[:, None, None] * eye - arm[:, :, None] * arm[:, None]
+        turning = matmul3(self.mobility, _turned(moments(touched * self.arms, self.arms)))
+        crossed = matmul3(_turned(arm[:, :, None] * arm[:, None]), self.mobility)
         share = touched.sum((1, 2, 3, 4)) / self.mass
-        both = jnp.trace(crossed @ own, axis1=1, axis2=2) / self.mass
-        squared = 3 * share**2 + 2 * both + jnp.einsum("bij,bji->b", turning, turning)
+        both = _trace(crossed) / self.mass
+        squared = 3 * share**2 + 2 * both + _trace(matmul3(turning, turning))
         return jnp.sqrt(jnp.maximum(squared, jnp.finfo(squared.dtype).tiny))
 
 
@@ -120,15 +115,15 @@ def _turning(bodies: Bodies, spin: Float[Array, "b 3"], cells: Float[Array, ""])
     The positions after the step are those of a rotation R, and R S − S Rᵀ is the step times the angular momentum, with
     S the second moments of mass (Moser and Veselov 1991, doi 10.1007/BF02352494).
     """
-    angular = jnp.einsum("bij,bj->bi", bodies.inertia, cells * spin)
+    angular = _times(bodies.inertia, cells * spin)
     eye = jnp.eye(3, dtype=spin.dtype)
 
     def missing(vector):
         turn = rotation_less_one(vector)
-        whole = (eye + turn) @ bodies.second
+        whole = matmul3(eye + turn, bodies.second)
         skew = whole - jnp.swapaxes(whole, 1, 2)
         held = jnp.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], 1)
-        return jnp.linalg.solve(bodies.inertia, (angular - held)[..., None])[..., 0]
+        return _times(bodies.mobility, angular - held)
 
     vector = cells * spin
     for _ in range(_TURNS):
@@ -144,12 +139,25 @@ def rotation_less_one(vector: Float[Array, "b 3"]) -> Float[Array, "b 3 3"]:
     rows = [jnp.stack(row, -1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
     skew = jnp.stack(rows, 1)
     half = jnp.sinc(angle / (2 * jnp.pi))
-    return jnp.sinc(angle / jnp.pi) * skew + half**2 / 2 * (skew @ skew)
+    return jnp.sinc(angle / jnp.pi) * skew + half**2 / 2 * matmul3(skew, skew)
 
 
 def moments(left: Velocities, right: Velocities) -> Float[Array, "b 3 3"]:
     """Σ left rightᵀ over the nodes of each body."""
     return jnp.stack([(left * right[..., k : k + 1]).sum((1, 2, 3)) for k in range(3)], -1)
+
+
+def _turned(second: Float[Array, "b 3 3"]) -> Float[Array, "b 3 3"]:
+    """Inertia of second moments of mass: Σ m (r² 1 − r rᵀ) of Σ m r rᵀ."""
+    return _trace(second)[:, None, None] * jnp.eye(3, dtype=second.dtype) - second
+
+
+def _trace(matrix: Float[Array, "b 3 3"]) -> Float[Array, "b"]:
+    return jnp.trace(matrix, axis1=1, axis2=2)
+
+
+def _times(matrix: Float[Array, "b 3 3"], vector: Float[Array, "b 3"]) -> Float[Array, "b 3"]:
+    return (matrix * vector[:, None]).sum(-1)
 
 
 def _of_nodes(of_bodies: Float[Array, "b k"] | Bool[Array, "b k"]) -> Array:
