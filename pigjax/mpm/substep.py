@@ -519,7 +519,7 @@ def _rigid_step(
         meets = meets | (filled & between.near)
 
     def resolve(velocity, mass):
-        if context.body_contact is not None:
+        if context.body_contact is not None and between is not None:
             velocity = context.body_contact.collide(velocity, mass, between)
         return apply_boundaries(statics, context, velocity, time=time).reshape(velocity.shape)
 

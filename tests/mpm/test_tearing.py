@@ -44,9 +44,8 @@ def test_the_work_of_tearing_is_that_of_the_law_up_to_its_limit_and_its_fading(x
     stress, damage = pulled(TEARING + model, tearing, path)
     end = LIMIT + 0.1 * (LIMIT - 1)
     fades = np.clip((np.asarray(path) - LIMIT) / (end - LIMIT), 0, 1)
-    still = jnp.zeros((3, 3, 1))
     F = jnp.zeros((3, 3, len(path))).at[0, 0].set(path).at[1, 1].set(1).at[2, 2].set(1)
-    plain = respond(model, F, still, 0.0, None, whole)
+    plain = respond(model, F, jnp.zeros_like(F), 0.0, None, whole)
     wanted = np.trapezoid((1 - fades) * plain.stress[0, 0] / path, path)
     work = np.trapezoid(stress, path)
     print(f"{model}: work of tearing {work:.4f} J/m³, wanted {wanted:.4f}")
@@ -57,7 +56,8 @@ def test_the_work_of_tearing_is_that_of_the_law_up_to_its_limit_and_its_fading(x
     after, kept = pulled(TEARING + model, tearing, back)
     assert np.all(np.asarray(kept)[1:] == 1)
     np.testing.assert_allclose(after[:-1], 0, atol=1e-9)
-    squeezed = respond(model, jnp.diag(jnp.asarray([0.8, 1.0, 1.0]))[..., None], still, 0.0, None, whole)
+    F = jnp.diag(jnp.asarray([0.8, 1.0, 1.0]))[..., None]
+    squeezed = respond(model, F, jnp.zeros_like(F), 0.0, None, whole)
     assert after[-1] == pytest.approx(squeezed.stress[0, 0, 0] / 0.8, rel=1e-12)
 
 
