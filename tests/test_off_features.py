@@ -144,7 +144,6 @@ SIGNS = {
     "fluid": (lambda: traced([material("fluid")]), lambda p: primitives(p)["cbrt"] > 0),
     "drucker_prager": (lambda: traced([material("drucker_prager")]), lambda p: primitives(p)["tan"] > 0),
     "von_mises": (lambda: traced([material("von_mises")]), lambda p: primitives(p)["exp"] > 0),
-    "tearing": (lambda: traced([material("tearing_neo_hookean")]), lambda p: in_steps(p)["clamp"] > 0),
     "foam": (lambda: traced([material("foam")]), lambda p: primitives(p)["pow"] > 0),
     "rigid bodies": (lambda: traced([Material("rigid", density=1e3)]), lambda p: primitives(p)["sin"] > 0),
     "gusts": (lambda: traced(forces=(Wind((1.0, 0, 0), 1.0, gusts=1.0),)), lambda p: primitives(p)["cos"] > 0),
@@ -164,6 +163,12 @@ def test_laws_of_the_table_without_particles_are_not_traced(plain):
     for law in ("fibres", "fluid", "drucker_prager", "von_mises", "foam"):
         assert not SIGNS[law][1](program), law
     assert in_steps(program) == in_steps(plain)
+
+
+def test_matter_that_does_not_tear_pays_nothing_for_it(plain):
+    torn, whole = material("tearing_neo_hookean"), material("neo_hookean")
+    assert in_steps(traced([torn])).total() > in_steps(plain).total()
+    assert in_steps(traced([whole, torn])) == in_steps(plain)
 
 
 def test_colliders_at_rest_are_found_once_and_moving_ones_in_each_step(plain):

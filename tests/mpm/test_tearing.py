@@ -40,7 +40,7 @@ def test_the_work_of_tearing_is_that_of_the_law_up_to_its_limit_and_its_fading(x
     """∫ P dλ is ∫ (1 − D) P₀ dλ with P₀ of the law without tearing; then no pull, but pressure as before."""
     more = {"fibre_stiffness": YOUNG} if model == "fibres" else {}
     whole, tearing = (table_of(model, limit, 0.3, **more).rows(0) for limit in (None, LIMIT))
-    path = jnp.linspace(1.0, 2.0, 20_001)
+    path = jnp.linspace(1.0, 2.0, 2001)
     stress, damage = pulled(TEARING + model, tearing, path)
     end = LIMIT + 0.1 * (LIMIT - 1)
     fades = np.clip((np.asarray(path) - LIMIT) / (end - LIMIT), 0, 1)
