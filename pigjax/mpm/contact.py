@@ -56,23 +56,6 @@ class BodyContact(eqx.Module):
         check_fields(self)
 
     def part(
-        self,
-        velocity: Float[Array, "b x y z 3"],
-        mass: Float[Array, "b x y z 1"],
-        volume: Float[Array, "b x y z 1"],
-        moments: Float[Array, "b x y z 3"],
-    ) -> Float[Array, "b x y z 3"]:
-        """Velocities of each body's nodes [m/s] after contact; momentum is conserved.
-
-        Args:
-            velocity: before contact [m/s].
-            mass: in units of the heaviest particle.
-            volume: at rest [cells].
-            moments: Σ w V x of the matter in reach of a node, with x in cells.
-        """
-        return self.collide(velocity, mass, faces(volume, moments))
-
-    def collide(
         self, velocity: Float[Array, "b x y z 3"], mass: Float[Array, "b x y z 1"], faces: Faces
     ) -> Float[Array, "b x y z 3"]:
         """Velocities of each body's nodes [m/s] after contact at its faces; momentum of the masses is conserved."""

@@ -34,6 +34,7 @@ from pigjax.mpm import (
     to_rows,
 )
 from pigjax.mpm.adjoint import Steps, run_steps
+from pigjax.mpm.boundaries import touched_nodes
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.forces import Force, columns_of, weights_of, without_weights
@@ -46,7 +47,6 @@ from pigjax.mpm.substep import (
     grid_to_particles,
     particles_to_grid,
     substep,
-    touched_nodes,
     update_grid,
 )
 from pigjax.mpm.transfers import KERNELS
@@ -156,6 +156,7 @@ def run_frames(
         force_columns=columns_of(inputs.forces),
         warp=warp,
         in_order=config.deterministic,
+        contact_rounds=config.contact_rounds,
     )
     run = partial(_frames, statics, config, frames, inputs.substeps, of or frames)
     if devices > 1:

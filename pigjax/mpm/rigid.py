@@ -7,17 +7,20 @@ the particles as one. So the body needs no state beyond its particles, and all t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.linalg import inv3, matmul3, safe_norm
 
-_ROUNDS = 20  # of contact; a box that lies on a floor keeps 1 % of its tilting speed, and 1e-4 of its falling speed
+# Nodes at which rounds of contact are solved apart from the others: a share of all, and at least so many.
+_SHARE, _FEWEST = 16, 512
 _RELAXATION = 1.4  # over the Frobenius norm of the answer, whose largest eigenvalue comes twice: no body overshoots
 _FAINT = 1e-12  # share of a body in contact that is none
 _TURNS = 4  # each gains the angle of a step in accuracy: 1e-2 rad leave 1e-8 of it
@@ -68,45 +71,105 @@ class Bodies(NamedTuple):
         return jnp.sqrt(jnp.maximum(squared, jnp.finfo(squared.dtype).tiny))
 
 
+class Nodes(NamedTuple):
+    """The nodes at which contact is solved, all of the grid or some of them."""
+
+    velocity: Velocities  # of bodies that are not rigid [m/s]
+    weight: Masses  # with which the bodies meet
+    arms: Velocities  # from the centres of mass of the bodies [cells]
+    faces: Any  # of each body, for `resolve`: arrays [b x y z ...]
+    bounds: Any  # that all bodies share, for `resolve`: arrays [x y z ...]
+
+    def at(self, index: Int[Array, "k"]) -> Nodes:
+        """Some of them, as a grid of k by 1 by 1; those whose number is that of all nodes weigh nothing."""
+
+        def pick(lead, array):
+            flat = array.reshape(*array.shape[:lead], -1, *array.shape[lead + 3 :])
+            some = jnp.take(flat, index, axis=lead, mode="clip")
+            return some.reshape(*some.shape[: lead + 1], 1, 1, *some.shape[lead + 1 :])
+
+        some = Nodes(*jax.tree.map(partial(pick, 1), self[:4]), jax.tree.map(partial(pick, 0), self.bounds))
+        real = index < math.prod(self.weight.shape[1:4])
+        return some._replace(weight=jnp.where(real[:, None, None, None], some.weight, 0.0))
+
+
+Resolve = Callable[[Velocities, Masses, Any, Any], Velocities]
+
+
 def rigid_velocities(
     rigid: Bool[Array, "b"],
     mass: Masses,
     velocity: Velocities,
     touched: Bool[Array, "b x y z 1"],
-    resolve: Callable[[Velocities, Masses], Velocities],
+    resolve: Resolve,
+    faces: Any,
+    bounds: Any,
     cells: Float[Array, ""],
+    rounds: int,
 ) -> Velocities:
     """Velocities of the nodes of all bodies [m/s] after contact, those of rigid bodies by which they turn and move.
 
     Contact is solved in rounds. In each of them a rigid body meets others with masses at its nodes that add up to about
     its own at those in contact; the impulses there, taken from the others, change the motion of the whole body. So
-    momentum is exchanged exactly in every round, and friction is bounded by the normal impulse of its round.
+    momentum is exchanged exactly in every round, and friction is bounded by the normal impulse of its round. The rounds
+    visit the nodes at which a rigid body may be in contact; elsewhere other bodies meet once.
 
     Args:
         rigid: which bodies are.
         mass: of the nodes, in units of the heaviest particle.
         velocity: before contact [m/s].
-        touched: nodes where contact may be.
-        resolve: contact: velocities before it and masses to those after it.
+        touched: nodes where a body may be in contact.
+        resolve: contact at some nodes or all: velocities before it, masses, and their `faces` and `bounds` to the
+            velocities after it.
+        faces: arrays [b x y z ...] of each body, which `resolve` takes.
+        bounds: arrays [x y z ...] that all bodies share, which `resolve` takes.
         cells: displacement in a step at 1 m/s [cells].
+        rounds: of contact.
     """
     bodies, stiff = Bodies.of(mass), _of_nodes(rigid[:, None])
     norm = bodies.response(jnp.where(touched, mass, 0.0))
     more = jnp.where(rigid & (norm > _FAINT), _RELAXATION / jnp.maximum(norm, _FAINT), 1.0)
     weight = mass * jnp.where(stiff, _of_nodes(more[:, None]), 1.0)
+    met = (touched & stiff).any((0, -1))
+    solve = partial(_solve, resolve, rounds, stiff, bodies, bodies.motion(mass * velocity))
+    nodes, few = Nodes(velocity, weight, bodies.arms, faces, bounds), max(_FEWEST, met.size // _SHARE)
+
+    def at_some():
+        index = jnp.nonzero(met.ravel(), size=few, fill_value=met.size)[0]
+        after, *found = solve(nodes.at(index))
+        flat = velocity.reshape(len(mass), -1, 3).at[:, index].set(after[:, :, 0, 0], mode="drop")
+        return flat.reshape(velocity.shape), *found
+
+    def at_all():
+        return solve(nodes)
+
+    after, moving, spin = at_all() if few >= met.size else lax.cond(met.sum() <= few, at_some, at_all)
+    velocity = jnp.where(met[..., None], after, resolve(velocity, mass, faces, bounds))
+    gradient = _turning(bodies, spin, cells)
+    turned = _of_nodes(moving) + (gradient[:, None, None, None] * bodies.arms[..., None, :]).sum(-1)
+    return jnp.where(stiff, turned, velocity)
+
+
+def _solve(
+    resolve: Resolve,
+    rounds: int,
+    stiff: Bool[Array, "b 1 1 1 1"],
+    bodies: Bodies,
+    motion: tuple[Float[Array, "b 3"], Float[Array, "b 3"]],
+    nodes: Nodes,
+) -> tuple[Velocities, Float[Array, "b 3"], Float[Array, "b 3"]]:
+    """Velocities of the nodes, and velocities and spins of the rigid bodies after all rounds."""
+    bodies = bodies._replace(arms=nodes.arms)
 
     @jax.checkpoint
     def visit(_, carry):
         velocity, moving, spin = carry
         before = jnp.where(stiff, bodies.field(moving, spin), velocity)
-        after = resolve(before, weight)
-        faster, turned = bodies.motion(jnp.where(stiff, weight * (after - before), 0.0))
+        after = resolve(before, nodes.weight, nodes.faces, nodes.bounds)
+        faster, turned = bodies.motion(jnp.where(stiff, nodes.weight * (after - before), 0.0))
         return after, moving + faster, spin + turned
 
-    velocity, moving, spin = lax.fori_loop(0, _ROUNDS, visit, (velocity, *bodies.motion(mass * velocity)))
-    gradient = _turning(bodies, spin, cells)
-    turned = _of_nodes(moving) + (gradient[:, None, None, None] * bodies.arms[..., None, :]).sum(-1)
-    return jnp.where(stiff, turned, velocity)
+    return lax.fori_loop(0, rounds, visit, (nodes.velocity, *motion))
 
 
 def _turning(bodies: Bodies, spin: Float[Array, "b 3"], cells: Float[Array, ""]) -> Float[Array, "b 3 3"]:

@@ -10,9 +10,9 @@ import pytest
 
 from pigjax.core.errors import InputError
 from pigjax.mls_mpm import SimConfig, rollout
-from pigjax.mpm import Grid, make_particles
+from pigjax.mpm import Grid, make_particles, rigid
 from pigjax.mpm.colliders import Plane
-from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.contact import BodyContact, Faces
 from pigjax.mpm.materials import Material, material_table
 
 DX = 0.05
@@ -97,6 +97,35 @@ def test_a_collision_exchanges_momentum_exactly_and_rigid_bodies_keep_their_shap
         np.testing.assert_allclose(new - new.mean(0), (old - old.mean(0)) @ F[0].T, atol=1e-10)
 
 
+def test_the_nodes_in_contact_alone_give_what_all_nodes_give(monkeypatch, x64):
+    """And so do more of them than there is room for."""
+    rng, shape = np.random.default_rng(2), (2, 11, 10, 9)
+    place = np.stack(np.meshgrid(*map(np.arange, shape[1:]), indexing="ij"), -1) - (5.0, 4.5, 4.0)
+    side = np.where(np.arange(2) == 0, -1, 1)[:, None, None, None] * place[..., 2]
+    mass = jnp.asarray(np.where(side > -1, rng.uniform(0.5, 1, shape), 0.0))[..., None]
+    near = jnp.asarray(np.broadcast_to(np.abs(place[..., 2]) < 1, shape))[..., None]
+    normal = jnp.broadcast_to(jnp.asarray([[0, 0, 1.0], [0, 0, -1.0]])[:, None, None, None], (*shape, 3))
+    velocity = jnp.asarray(rng.normal(size=(*shape, 3))) - normal * -2.0
+
+    def found(fewest):
+        monkeypatch.setattr(rigid, "_FEWEST", fewest)
+        monkeypatch.setattr(rigid, "_SHARE", 10**6)
+        contact = BodyContact(bodies=2, friction=0.3)
+
+        def resolve(velocity, mass, faces, bounds):
+            return contact.part(velocity, mass, faces)
+
+        which, faces = jnp.asarray([True, False]), Faces(near, normal)
+        return rigid.rigid_velocities(which, mass, velocity, near, resolve, faces, (), jnp.asarray(0.01), 20)
+
+    nodes = int(near[0].sum())
+    wanted = found(10**4)
+    assert float(jnp.abs(wanted - velocity)[1].max()) > 0.1
+    for room in (nodes + 30, nodes, nodes - 1):
+        np.testing.assert_allclose(found(room), wanted, rtol=0, atol=1e-13)
+
+
+@pytest.mark.slow
 def test_a_tumbling_brick_keeps_its_angular_momentum_and_its_energy(x64):
     """About the middle axis, where the free motion is unstable; explicit Euler would gain energy."""
     particles, table = matter((lattice((0.3, 0.2, 0.1), (0.35, 0.25, 0.3)), 0))
@@ -109,11 +138,13 @@ def test_a_tumbling_brick_keeps_its_angular_momentum_and_its_energy(x64):
     assert energy[1] == pytest.approx(energy[0], rel=0.02)
 
 
-@pytest.mark.parametrize(("friction", "angle"), [(0.3, 30.0), (0.0, 30.0), (0.7, 30.0)])
+@pytest.mark.parametrize(
+    ("friction", "angle"), [(0.3, 30.0), *(pytest.param(mu, 30.0, marks=pytest.mark.slow) for mu in (0.0, 0.7))]
+)
 def test_a_block_slides_down_an_incline_as_coulomb_says(friction, angle):
     """g (sin θ − μ cos θ) t²/2, or nothing where μ > tan θ; the incline is a floor under tilted gravity."""
     particles, table = matter((lattice((0.15, 0.15, 0.1), (0.2, 0.2, FLOOR)), 0))
-    slope, time, nodes = math.radians(angle), 0.2, (14, 11, 11)
+    slope, time, nodes = math.radians(angle), 0.2, (15, 13, 13)  # no wall in reach
     gravity = (9.81 * math.sin(slope), 0.0, -9.81 * math.cos(slope))
     # from where the block has settled on the floor
     settled, _ = run(particles, table, nodes=nodes, steps=50, gravity=(0.0, 0.0, -9.81), floor=1.0)
@@ -121,18 +152,19 @@ def test_a_block_slides_down_an_incline_as_coulomb_says(friction, angle):
     went = middle(end) - middle(settled)
     wanted = max(9.81 * (math.sin(slope) - friction * math.cos(slope)), 0) * time**2 / 2
     print(f"friction {friction}: slid {went[0]:.4f} m, wanted {wanted:.4f} m; sank {-went[2]:.4f} m")
-    assert went[0] == pytest.approx(wanted, rel=0.02, abs=2e-3)
+    assert went[0] == pytest.approx(wanted, rel=0.02, abs=1e-3)
     assert abs(went[1]) < 1e-3
     assert abs(went[2]) < 0.1 * DX
 
 
+@pytest.mark.slow
 def test_a_ball_rolls_down_an_incline_and_turns_as_it_goes():
     """(5/7) g sin θ, as far as a ball is round whose surface is cells: within 10 %."""
     radius, time, slope = 0.15, 0.3, math.radians(15)
     points = lattice((2 * radius,) * 3, (0.22, 0.22, FLOOR))
     ball = points[np.linalg.norm(points - (0.22 + radius, 0.22 + radius, FLOOR + radius), axis=1) < radius]
     particles, table = matter((ball, 0))
-    nodes = (16, 14, 14)
+    nodes = (20, 17, 17)  # no wall in reach
     settled, _ = run(particles, table, nodes=nodes, steps=50, gravity=(0.0, 0.0, -9.81), floor=1.0)
     gravity = (9.81 * math.sin(slope), 0.0, -9.81 * math.cos(slope))
     end, _ = run(settled, table, nodes=nodes, steps=round(time / STEP), gravity=gravity, floor=1.0)
@@ -151,7 +183,7 @@ def rest_of_a_stack(seconds):
     low = lattice((0.2, 0.2, 0.1), (0.2, 0.2, FLOOR))
     high = lattice((0.15, 0.15, 0.1), (0.225, 0.225, FLOOR + 0.1))
     particles, table = matter((low, 0), (high, 0))
-    steps = {"nodes": (12, 12, 13), "gravity": (0.0, 0.0, -9.81), "floor": 0.5, "friction": 0.5}
+    steps = {"nodes": (13, 13, 15), "gravity": (0.0, 0.0, -9.81), "floor": 0.5, "friction": 0.5}
     settled, _ = run(particles, table, steps=100, **steps)
     end, _ = run(settled, table, steps=round(seconds / STEP), **steps)
     for k in range(2):

@@ -35,7 +35,10 @@ def pulled(model, m, stretches):
     return jax.lax.scan(step, jnp.zeros(1, stretches.dtype), stretches)[1]
 
 
-@pytest.mark.parametrize("model", ["fixed_corotated", "neo_hookean", "stvk_hencky", "fibres"])
+OTHERS = [pytest.param(model, marks=pytest.mark.slow) for model in ("neo_hookean", "stvk_hencky", "fibres")]
+
+
+@pytest.mark.parametrize("model", ["fixed_corotated", *OTHERS])
 def test_the_work_of_tearing_is_that_of_the_law_up_to_its_limit_and_its_fading(x64, model):
     """∫ P dλ is ∫ (1 − D) P₀ dλ with P₀ of the law without tearing; then no pull, but pressure as before."""
     more = {"fibre_stiffness": YOUNG} if model == "fibres" else {}
@@ -58,58 +61,87 @@ def test_the_work_of_tearing_is_that_of_the_law_up_to_its_limit_and_its_fading(x
     np.testing.assert_allclose(after[:-1], 0, atol=1e-9)
     F = jnp.diag(jnp.asarray([0.8, 1.0, 1.0]))[..., None]
     squeezed = respond(model, F, jnp.zeros_like(F), 0.0, None, whole)
-    assert after[-1] == pytest.approx(squeezed.stress[0, 0, 0] / 0.8, rel=1e-12)
+    assert float(after[-1]) == pytest.approx(float(squeezed.stress[0, 0, 0]) / 0.8, rel=1e-10)  # rounding of the SVD
 
 
-def bar(table, length=0.4, width=0.08, centre=(0.5, 0.5, 0.5)):
-    axes = [(np.arange(round(side / DX * 2)) + 0.5) * DX / 2 - side / 2 for side in (length, width, width)]
-    x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3) + centre
-    return make_particles(jnp.asarray(x, jnp.float32), volume=(DX / 2) ** 3, table=table)
+def bar(table, length=0.4, width=0.08, *, dx=DX, stretch=1.0, middle=0.5):
+    """A bar along x, of cells `dx` at rest, and stretched."""
+    axes = [(np.arange(round(side / dx * 2)) + 0.5) * dx / 2 - side / 2 for side in (length, width, width)]
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3) * (stretch, 1, 1) + (0.5, middle, middle)
+    particles = make_particles(jnp.asarray(x, jnp.float32), volume=(dx / 2) ** 3, table=table)
+    F = jnp.broadcast_to(jnp.diag(jnp.asarray([stretch, 1, 1], jnp.float32)), particles.F.shape)
+    return eqx.tree_at(lambda p: p.F, particles, F)
 
 
-GRID = Grid(jnp.zeros(3), jnp.asarray(DX), (51, 51, 51))
+STRAIN, WIDTH, TIME = 0.05, 0.04, 0.06
 
 
+def elastic_energy(particles):
+    """∫ E/2 Σ (σ − 1)² dV [J] of fixed corotated matter with Poisson's ratio 0, without the pull of torn matter."""
+    strain = np.linalg.svd(np.asarray(particles.F, float), compute_uv=False) - 1
+    whole = (1 - np.asarray(particles.hardening, float))[:, None] * np.maximum(strain, 0) ** 2
+    each = YOUNG / 2 * (whole + np.minimum(strain, 0) ** 2).sum(1)
+    return float((np.asarray(particles.volume0, float) * each).sum())
+
+
+def snapped(refine, *, cut=True):
+    """Momentum of a half, energy of motion, and elastic energy lost by a taut bar held at its ends."""
+    dx, table = DX / refine, table_of(limit=1.08)
+    particles = bar(table, 0.56, WIDTH, dx=dx, stretch=1 + STRAIN, middle=0.1)
+    if cut:
+        torn = np.abs(np.asarray(particles.x[:, 0]) - 0.5) < 1.5 * dx * (
+            1 + STRAIN
+        )  # whole matter shares no node across
+        F = np.asarray(particles.F) + torn[:, None, None] * np.diag([0.3, 0, 0])
+        hardening = np.asarray(particles.hardening) + torn
+        particles = eqx.tree_at(
+            lambda p: (p.F, p.hardening), particles, (jnp.asarray(F, jnp.float32), jnp.asarray(hardening, jnp.float32))
+        )
+    held = (BoxRegion((0.0, 0, 0), (0.23, 1, 1)), BoxRegion((0.77, 0, 0), (1.0, 1, 1)))
+    grid = Grid(jnp.zeros(3), jnp.asarray(dx), (50 * refine + 1, 10 * refine + 1, 10 * refine + 1))
+    config = SimConfig(substeps=40 * refine, devices=1)
+    end, _, health = rollout(
+        particles, grid, table, config, frames=1, frame_dt=TIME, gravity=(0.0, 0, 0), pins=held
+    )  # fmt: skip
+    health.raise_if_bad()
+    momentum = float(jnp.where(particles.x[:, 0] > 0.5, end.mass * end.v[:, 0], 0.0).sum())
+    motion = float((end.mass * (end.v**2).sum(1)).sum() / 2)
+    return momentum, motion, elastic_energy(particles) - elastic_energy(end)
+
+
+@pytest.mark.slow
 def test_a_taut_bar_that_snaps_turns_its_elastic_energy_into_motion():
-    """Held at its ends at a stretch of 1 + ε, cut in the middle: a wave unloads it at c = √(E/ρ), with velocity ε c
-    behind it. In a time t each half gets the momentum E ε A t, and ½ E ε² A 2 c t of energy is released, of which the
-    transfers take a part where the front is a few cells wide. Without tearing the bar stays at rest."""
-    strain, time, pulls = 0.05, 0.03, []
+    """Cut in its middle, a wave at c = √(E/ρ) unloads each half, which moves at ε c behind it: in a time t a half gets
+    the momentum E ε A t, and both lose the elastic energy E ε² A c t, which is that of their motion. What is missing is
+    due to the cells of the cut, of width h, and to the front, which the transfers smear over a width that grows as
+    √(h c t) or less: half the spacing leaves at most √½ of it."""
     wave = np.sqrt(YOUNG / 1000.0)
-    energies = []
-    for limit in (1.08, None):
-        table = table_of(limit=limit)
-        particles = bar(table)
-        F = np.broadcast_to(np.eye(3), (len(particles), 3, 3)).copy()
-        middle = np.abs(np.asarray(particles.x[:, 0]) - 0.5) < DX
-        F[:, 0, 0] = np.where(middle & (limit is not None), 1.3, 1 + strain)
-        particles = eqx.tree_at(lambda p: p.F, particles, jnp.asarray(F, jnp.float32))
-        held = [BoxRegion((0.0, 0, 0), (0.32, 1, 1)), BoxRegion((0.68, 0, 0), (1.0, 1, 1))]
-        end, _, health = rollout(
-            particles, GRID, table, SimConfig(substeps=20, devices=1), frames=1, frame_dt=time, gravity=(0.0, 0, 0),
-            pins=tuple(held),
-        )  # fmt: skip
-        health.raise_if_bad()
-        energies.append(float((end.mass * (end.v**2).sum(1)).sum() / 2))
-        pulls.append(float(jnp.where(particles.x[:, 0] > 0.5, end.mass * end.v[:, 0], 0.0).sum()))
-    released = YOUNG * strain**2 / 2 * 0.08**2 * 2 * wave * time
-    print(f"energy of motion {energies[0]:.5f} J, released {released:.5f} J, without a tear {energies[1]:.1e} J")
-    print(f"momentum of a half {pulls[0]:.4f} N s, wanted {YOUNG * strain * 0.08**2 * time:.4f}")
-    assert pulls[0] == pytest.approx(YOUNG * strain * 0.08**2 * time, rel=0.1)
-    assert 0.4 * released < energies[0] < 1.02 * released
-    assert energies[1] < 0.01 * energies[0]
+    pull, energy = YOUNG * STRAIN * WIDTH**2 * TIME, YOUNG * STRAIN**2 * WIDTH**2 * wave * TIME
+    missing = []
+    for refine in (1, 2):
+        momentum, motion, lost = snapped(refine)
+        print(f"dx/{refine}: momentum {momentum / pull:.4f}, motion {motion / energy:.4f}, elastic {lost / energy:.4f}")
+        assert motion < lost
+        missing.append(1 - np.array([momentum / pull, motion / energy, lost / energy]))
+    assert np.all(missing[1] > 0)
+    assert np.all(missing[1] < 0.75 * missing[0])
+    assert np.all(missing[1][[0, 2]] < 0.05)  # 19 cells are unloaded: a cell of the cut is as much
+    _, still, kept = snapped(1, cut=False)
+    assert still < 1e-6 * energy
+    assert abs(kept) < 1e-5 * energy
 
 
 def test_a_bar_pulled_fast_is_torn_in_two_and_one_pulled_slowly_is_not():
     """Ends that leave at ± v: with the limit they part and go on, without it they come back."""
+    grid = Grid(jnp.zeros(3), jnp.asarray(DX), (51, 11, 11))
     gaps, momenta = [], []
     for limit in (1.15, None):
         table = table_of("neo_hookean", limit)
-        particles = bar(table, length=0.3, width=0.06)
+        particles = bar(table, 0.3, WIDTH, middle=0.1)
         side = np.sign(np.asarray(particles.x[:, :1]) - 0.5)
         particles = eqx.tree_at(lambda p: p.v, particles, jnp.asarray(1.2 * side * [1.0, 0, 0], jnp.float32))
         end, _, health = rollout(
-            particles, GRID, table, SimConfig(substeps=150, devices=1), frames=1, frame_dt=0.1, gravity=(0.0, 0, 0),
+            particles, grid, table, SimConfig(substeps=100, devices=1), frames=1, frame_dt=0.1, gravity=(0.0, 0, 0),
         )  # fmt: skip
         assert not health.is_broken()
         x = np.sort(np.asarray(end.x[:, 0]))
