@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from pigjax.core.linalg import inv3, matmul3, safe_norm
 
 # Nodes at which rounds of contact are solved apart from the others: a share of all, and at least so many.
-_SHARE, _FEWEST = 16, 512
+_SHARE, _FEWEST = 32, 512
 _RELAXATION = 1.4  # over the Frobenius norm of the answer, whose largest eigenvalue comes twice: no body overshoots
 _FAINT = 1e-12  # share of a body in contact that is none
 _TURNS = 4  # each gains the angle of a step in accuracy: 1e-2 rad leave 1e-8 of it
@@ -88,7 +88,8 @@ class Nodes(NamedTuple):
             some = jnp.take(flat, index, axis=lead, mode="clip")
             return some.reshape(*some.shape[: lead + 1], 1, 1, *some.shape[lead + 1 :])
 
-        some = Nodes(*jax.tree.map(partial(pick, 1), self[:4]), jax.tree.map(partial(pick, 0), self.bounds))
+        some = jax.tree.map(partial(pick, 1), self._replace(bounds=()))
+        some = some._replace(bounds=jax.tree.map(partial(pick, 0), self.bounds))
         real = index < math.prod(self.weight.shape[1:4])
         return some._replace(weight=jnp.where(real[:, None, None, None], some.weight, 0.0))
 

@@ -148,11 +148,13 @@ def test_a_block_slides_down_an_incline_as_coulomb_says(friction, angle):
     gravity = (9.81 * math.sin(slope), 0.0, -9.81 * math.cos(slope))
     # from where the block has settled on the floor
     settled, _ = run(particles, table, nodes=nodes, steps=50, gravity=(0.0, 0.0, -9.81), floor=1.0)
-    end, _ = run(settled, table, nodes=nodes, steps=round(time / STEP), gravity=gravity, floor=friction)
+    end = settled
+    for _ in range(round(time / STEP / 50)):  # the same program again
+        end, _ = run(end, table, nodes=nodes, steps=50, gravity=gravity, floor=friction)
     went = middle(end) - middle(settled)
     wanted = max(9.81 * (math.sin(slope) - friction * math.cos(slope)), 0) * time**2 / 2
     print(f"friction {friction}: slid {went[0]:.4f} m, wanted {wanted:.4f} m; sank {-went[2]:.4f} m")
-    assert went[0] == pytest.approx(wanted, rel=0.02, abs=1e-3)
+    assert went[0] == pytest.approx(wanted, rel=0.01, abs=1e-3)  # the step adds dt over the time: 0.4 %
     assert abs(went[1]) < 1e-3
     assert abs(went[2]) < 0.1 * DX
 
@@ -165,9 +167,11 @@ def test_a_ball_rolls_down_an_incline_and_turns_as_it_goes():
     ball = points[np.linalg.norm(points - (0.22 + radius, 0.22 + radius, FLOOR + radius), axis=1) < radius]
     particles, table = matter((ball, 0))
     nodes = (20, 17, 17)  # no wall in reach
-    settled, _ = run(particles, table, nodes=nodes, steps=50, gravity=(0.0, 0.0, -9.81), floor=1.0)
+    settled, _ = run(particles, table, nodes=nodes, steps=75, gravity=(0.0, 0.0, -9.81), floor=1.0)
     gravity = (9.81 * math.sin(slope), 0.0, -9.81 * math.cos(slope))
-    end, _ = run(settled, table, nodes=nodes, steps=round(time / STEP), gravity=gravity, floor=1.0)
+    end = settled
+    for _ in range(round(time / STEP / 75)):
+        end, _ = run(end, table, nodes=nodes, steps=75, gravity=gravity, floor=1.0)
     went = middle(end) - middle(settled)
     spin = float(end.C[0, 0, 2] - end.C[0, 2, 0]) / 2
     speed = float(end.v[:, 0].mean())
@@ -179,31 +183,26 @@ def test_a_ball_rolls_down_an_incline_and_turns_as_it_goes():
     assert radius < speed / spin < radius + 1.5 * DX
 
 
-def rest_of_a_stack(seconds):
+@pytest.mark.slow
+def test_a_stack_rests_for_two_seconds():
     low = lattice((0.2, 0.2, 0.1), (0.2, 0.2, FLOOR))
     high = lattice((0.15, 0.15, 0.1), (0.225, 0.225, FLOOR + 0.1))
     particles, table = matter((low, 0), (high, 0))
-    steps = {"nodes": (13, 13, 15), "gravity": (0.0, 0.0, -9.81), "floor": 0.5, "friction": 0.5}
-    settled, _ = run(particles, table, steps=100, **steps)
-    end, _ = run(settled, table, steps=round(seconds / STEP), **steps)
+    steps = {"nodes": (13, 13, 15), "steps": 100, "gravity": (0.0, 0.0, -9.81), "floor": 0.5, "friction": 0.5}
+    settled, _ = run(particles, table, **steps)
+    end = settled
+    for _ in range(round(2 / STEP / 100)):
+        end, _ = run(end, table, **steps)
     for k in range(2):
         went = middle(end, k) - middle(settled, k)
         own = np.asarray(end.body) == k
         tilt = np.abs(np.asarray(end.F)[own] - np.asarray(settled.F)[own]).max()
-        print(f"{seconds} s: box {k} moved by {np.abs(went).max() / DX:.4f} cells and turned by {tilt:.1e}")
+        print(f"box {k} moved by {np.abs(went).max() / DX:.4f} cells and turned by {tilt:.1e}")
         assert np.abs(went).max() < 0.05 * DX
         assert tilt < 0.02
 
 
-def test_a_stack_rests():
-    rest_of_a_stack(0.1)
-
-
 @pytest.mark.slow
-def test_a_stack_rests_for_two_seconds():
-    rest_of_a_stack(2.0)
-
-
 def test_the_gradient_to_the_velocity_of_a_throw_agrees_with_central_differences(x64):
     """A brick that hits a jelly cube and the floor; the loss sees place, turn and what the cube got."""
     brick, cube = (0.15, 0.1, 0.1), (0.1, 0.1, 0.1)

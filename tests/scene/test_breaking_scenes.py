@@ -12,7 +12,7 @@ from pigjax.scene.plan import make_plan, read_inputs, segment
 BALL = {"id": 1, "material": "jelly"}
 SEEN = {"gaussians": "cloud.ply", "labels": "labels.npz"}
 BAD = {
-    "limit at rest": ({**BALL, "tearing_stretch": 1.0}, r"objects\.ball\.tearing_stretch = 1.*it must be > 1"),
+    "limit at rest": ({**BALL, "tearing_stretch": 1.0}, r"objects\.ball\.tearing_stretch = 1.*must be > 1"),
     "water that tears": (
         {"id": 1, "material": "water", "tearing_stretch": 1.5},
         r"objects\.ball\.tearing_stretch: only elastic matter tears.*this is fluid",
