@@ -18,7 +18,7 @@ from pigjax.core.errors import InputError, MissingFileError, SceneError
 from pigjax.core.regions import Region
 from pigjax.mpm.colliders import Box, Capsule, Collider, Cylinder, Plane, Sphere
 from pigjax.mpm.contact import broken_by
-from pigjax.mpm.materials import LAWS, PRESETS, Material, Parameters
+from pigjax.mpm.materials import LAWS, PRESETS, TEARING, Material, Parameters
 from pigjax.scene.accuracy import LEVELS, Accuracy, with_level
 from pigjax.scene.decode import Section, decode, merged
 from pigjax.scene.forces import AnyForce
@@ -35,6 +35,7 @@ _ANGLE = Limits(-1e6, 1e6, unit="degrees")
 _PIXELS = Limits(1, 16384, unit="px")
 _WEIGHT = Limits(-1e3, 1e3)
 _FRICTION = Limits(0, 1e6)
+RIGID_FRICTION = 0.5  # of objects on each other where one is rigid and the file says nothing
 INPUT_FILES = ("gaussians", "views", "images", "masks", "labels", "names")  # fields of `input` that hold paths
 
 
@@ -97,7 +98,7 @@ class SimulationSpec(Section, frozen=True):
     # "explicit" takes many cheap steps, "implicit" steps of a frame or so, for matter stiffer than about 1e8 Pa;
     # "auto" chooses by the cost
     integrator: Literal["explicit", "implicit", "auto"] = "explicit"
-    # of objects on each other, which then never fuse; None: one common field
+    # of objects on each other, which then never fuse; None: one common field, or 0.5 where an object is rigid
     contact_friction: Annotated[float, _FRICTION] | None = None
     # objects slower than this are left out until touched; None: never
     sleep: Annotated[float, Limits(0, 1e3, above=True, unit="cells/frame")] | None = None
@@ -202,6 +203,7 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     copies: Annotated[list[Triple], _PLACE] = field(default_factory=list)  # offsets of more of it, each its own object
     removed: bool = False  # its splats are left out, as if it had never stood there
     fixed: bool = False  # a still collider made from its own splats
+    rigid: bool = False  # neither bends nor breaks, and is pushed by what it meets; its material gives the density
     friction: Annotated[float, _FRICTION] = 0.5  # Coulomb's coefficient of a fixed object; that of many dry pairs
     fill: bool = False  # close the surface of a fixed object where those that move or are removed hid it
     material: str | None = None  # name of a preset; its numbers may be replaced by the fields below
@@ -223,6 +225,7 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     hardening_coefficient: Annotated[float, Limits()] | None = None
     critical_compression: Annotated[float, Limits()] | None = None
     critical_stretch: Annotated[float, Limits()] | None = None
+    tearing_stretch: Annotated[float, Limits()] | None = None  # of elastic matter that tears: 1.5 at half as long again
     fibre_stiffness: Annotated[float, Limits(unit="Pa")] | None = None
     fibre_azimuth: Annotated[float, Limits(unit="rad")] | None = None
     fibre_elevation: Annotated[float, Limits(unit="rad")] | None = None
@@ -234,12 +237,16 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
             for name in ("material", "model"):
                 yield name, getattr(self, name) is None, rule
             yield "fixed", not self.fixed, rule
+            yield "rigid", not self.rigid, rule
         if self.fixed:
             for name in ("material", "model", *_NUMBERS):
                 yield name, getattr(self, name) is None, "a fixed object has no material; remove one of the two"
             for name in ("velocity", "angular_velocity"):
                 yield name, not any(getattr(self, name)), "a fixed object does not move; remove one of the two"
+            yield "rigid", not self.rigid, "a fixed object does not move; remove one of the two"
             yield "start", self.start == 0, "a fixed object does not move; remove one of the two"
+        rule = "a rigid object does not break; remove one of the two"
+        yield "tearing_stretch", not self.rigid or self.tearing_stretch is None, rule
         yield "fill", self.fixed or not self.fill, "only a fixed object is filled; give fixed = true, or remove it"
         yield "fill", self.gaussians is None or not self.fill, "nothing hid an object from a file of its own; remove it"
         both = self.gaussians is not None and (self.within is not None or self.id is not None)
@@ -270,6 +277,17 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
                 raise SceneError(f"objects.{name}.{key} = {value!r}: {suggest(value, known)}.")
         settings: dict[str, Any] = dict(PRESETS[self.material]) if self.material else {"model": self.model}
         settings |= {key: value for key in _NUMBERS if (value := getattr(self, key)) is not None}
+        if self.rigid:
+            settings["model"] = "rigid"
+        torn = TEARING + settings["model"]
+        if self.tearing_stretch is not None and torn in LAWS:
+            settings["model"] = torn
+        elif self.tearing_stretch is not None and not settings["model"].startswith(TEARING):
+            able = ", ".join(law.removeprefix(TEARING) for law in LAWS if law.startswith(TEARING))
+            raise SceneError(
+                f"objects.{name}.tearing_stretch: only elastic matter tears, of model {able}; this is"
+                f" {settings['model']}. Remove the field, or take such a material."
+            )
         if "density" not in settings:
             raise SceneError(f"objects.{name}.density is missing: give it in kg/m³.")
         try:
@@ -402,13 +420,22 @@ class Scene(Section, frozen=True):
         up = self.input.up
         rule = "world.up turns the scene so that z points up; remove input.up"
         yield "input.up", self.world.up is None or up == "z", rule
-        in_contact = moving > 1 and self.simulation.contact_friction is not None
-        broken = broken_by(self.simulation.integrator) if in_contact else None
-        yield "simulation.integrator", broken is None, f"{broken}, or remove simulation.contact_friction"
+        rigid = [name for name, spec in self.objects.items() if spec.rigid]
+        broken = broken_by(self.simulation.integrator) if rigid or self.contact_friction is not None else None
+        which = joined("objects", rigid[0], "rigid") if rigid else "simulation.contact_friction"
+        yield "simulation.integrator", broken is None, f"{broken}, or remove {which}"
         for name in ("width", "height"):
             side = round(getattr(self.camera, name) * self.drawing.scale)
             rule = f"camera.{name} times it {_PIXELS.broken(side)}, and is {side} px; lower one of the two"
             yield "drawing.scale", side <= _PIXELS.high, rule
+
+    @property
+    def contact_friction(self) -> float | None:
+        """Friction of the objects on each other; None where there is no second one, or all share one velocity field."""
+        given, moving = self.simulation.contact_friction, [spec for spec in self.objects.values() if spec.moves]
+        if len(moving) < 2:
+            return None
+        return RIGID_FRICTION if given is None and any(spec.rigid for spec in moving) else given
 
     def path(self, name: str) -> Path:
         """A path of the file, seen from the working directory."""

@@ -35,6 +35,7 @@ class Parameters(eqx.Module):
     hardening_coefficient: Float[Array, "*m"] = _number(default=10.0)  # ξ of snow
     critical_compression: Float[Array, "*m"] = _number(default=2.5e-2)  # strain at which snow is packed
     critical_stretch: Float[Array, "*m"] = _number(default=7.5e-3)  # strain at which snow breaks
+    tearing_stretch: Float[Array, "*m"] = _number(default=0.0)  # length over that at rest at which matter tears
     fibre_stiffness: Float[Array, "*m"] = _number(default=0.0)  # Young's modulus that fibres add along them [Pa]
     fibre_azimuth: Float[Array, "*m"] = _number(default=0.0)  # of fibres at rest, about z from x [rad]
     fibre_elevation: Float[Array, "*m"] = _number(default=0.0)  # of fibres at rest, above the plane of x and y [rad]

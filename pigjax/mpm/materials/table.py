@@ -81,6 +81,7 @@ LIMITS: dict[str, tuple[str, Limits]] = {
     "hardening_coefficient": ("the hardening coefficient", Limits(0.0, 1e3)),
     "critical_compression": ("the critical compression", Limits(0, 1, above=True, below=True)),
     "critical_stretch": ("the critical stretch", Limits(0, 1e3, above=True)),
+    "tearing_stretch": ("the stretch at which matter tears", Limits(1, 1e3, above=True)),
     "fibre_stiffness": ("the stiffness of fibres", Limits(0, above=True, unit="Pa")),
     "fibre_azimuth": ("the azimuth of fibres", Limits(-1e6, 1e6, unit="rad")),
     "fibre_elevation": ("the elevation of fibres", Limits(-1e6, 1e6, unit="rad")),
