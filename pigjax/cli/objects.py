@@ -66,9 +66,7 @@ def reconstruct(
     only: Annotated[int | None, typer.Option(help="Fit only what the masks give this id.")] = None,
     random_background: Annotated[bool, typer.Option(help="A new colour each step behind what masks cover.")] = False,
     exposure: Annotated[bool, typer.Option(help="Fit gains of red, green and blue to each photo.")] = False,
-    shell: Annotated[
-        float, typer.Option(help="Share of Gaussians on a far sphere, for sky.", min=0, max=0.99)
-    ] = 0.0,
+    shell: Annotated[float, typer.Option(help="Share of Gaussians on a far sphere, for sky.", min=0, max=0.99)] = 0.0,
     halvings: Annotated[int, typer.Option(help="Begin with photos halved this often.", min=0, max=8)] = 0,
     error_views: Annotated[
         int, typer.Option(help="Photos whose errors draw Gaussians before a relocation; 0: by opacity.", min=0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from pigjax.core.camera import Camera, focus_of
@@ -84,7 +84,12 @@ def covering_sample(points: Float[np.ndarray, "n 3"], count: int, *, seed: int =
 
 
 def far_shell(
-    cameras: Camera, points: Float[np.ndarray, "n 3"], images: Float[np.ndarray | Array, "v h w 3"], count: int
+    cameras: Camera,
+    points: Float[np.ndarray, "n 3"],
+    images: Float[np.ndarray | Array, "v h w 3"],
+    count: int,
+    *,
+    valid: Bool[np.ndarray | Array, "v h w"] | None = None,
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
     """Points on a sphere around a scene, where some camera sees them: sky, and background without sparse points. Host.
 
@@ -97,6 +102,7 @@ def far_shell(
         points: sparse points [m].
         images: photos of these views, in 0..1.
         count: number of points.
+        valid: pixels that show the scene; None: all.
 
     Returns:
         Positions [m] and colours: the mean of the photos where they show the point.
@@ -117,6 +123,9 @@ def far_shell(
             place = local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None] * focal[k] + middle[k]
             shown = ahead & (place >= 0).all(1) & (place < size).all(1)
             column, row = place[shown].astype(int).T
+            if valid is not None:
+                shown[shown] = np.asarray(valid[k])[row, column]
+                column, row = place[shown].astype(int).T
             total[shown] += image[row, column]
             seen += shown
         if (found := int((seen > 0).sum())) >= count:

@@ -48,6 +48,7 @@ from pigjax.splat import Gaussians, render
 from pigjax.splatting.binning import shards_of
 from pigjax.splatting.sharding import replicate
 
+Cloud = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]  # positions [m] and colours (0 to 1)
 _LEAST_SHELL = 4  # points that a shell is worth making of
 
 
@@ -95,7 +96,7 @@ def reconstruct(
     views: io.Views,
     config: FitConfig = FitConfig(),
     *,
-    points: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]] | None = None,
+    points: Cloud | None = None,
     checkpoint: Path | None = None,
     previews: Path | None = None,
     callback: Callable[[Progress], None] | None = None,
@@ -119,7 +120,8 @@ def reconstruct(
 
     Raises:
         StaleError: the checkpoint was made from other photos, cameras, masks, points or settings; it names which.
-        InputError: no training views, too few points, or no masks where the settings need them.
+        InputError: no training views, too few points, no masks where the settings need them, or a far shell where
+            masks leave the background out.
     """
     # with a capacity, splats would be dropped silently
     config = replace(config, render=replace(config.render, capacity=None, differentiation="reverse"))
@@ -128,6 +130,8 @@ def reconstruct(
     train, held_out = views.training, views.held_out
     config = with_budget(config, train.cameras)
     assert config.splats is not None
+    if config.shell and (config.object_id is not None or config.random_background):
+        raise InputError(f"FitConfig.shell = {config.shell}: masks leave the background out; leave it 0 with them.")
     if points is None:
         points = random_points(train.cameras, min(config.splats, 5000), seed=config.seed)
     extent = scene_extent(points[0], name="points").spread
@@ -190,14 +194,15 @@ def reconstruct(
     )
 
 
-def _start(points, train: io.Views, count: int, config: FitConfig) -> Gaussians:
+def _start(points: Cloud, train: io.Views, count: int, config: FitConfig) -> Gaussians:
     """Gaussians on the sparse points, and a share of them on a far shell where that is asked for."""
     on_shell = int(config.shell * count)
-    near = start_gaussians(*points, count - on_shell, config.sh_degree, seed=config.seed)
-    if on_shell < _LEAST_SHELL:
-        return near if not on_shell else start_gaussians(*points, count, config.sh_degree, seed=config.seed)
-    shell = far_shell(train.cameras, points[0], train.images, on_shell)
-    far = start_gaussians(*shell, on_shell, config.sh_degree, seed=config.seed)
+    on_shell = on_shell if on_shell >= _LEAST_SHELL else 0
+    near = start_gaussians(points[0], points[1], count - on_shell, config.sh_degree, seed=config.seed)
+    if not on_shell:
+        return near
+    shell, rgb = far_shell(train.cameras, points[0], train.images, on_shell, valid=train.valid)
+    far = start_gaussians(shell, rgb, on_shell, config.sh_degree, seed=config.seed)
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), near, far)
 
 
@@ -277,7 +282,7 @@ def _resume(
     """
     counts = sorted({count_at(step, config) for step in range(0, config.steps + 1, config.grow_every)})
     damage: InputError | None = None
-    for count in dict.fromkeys([*counts, config.splats]):
+    for count in counts:
         try:
             return io.load_pytree(checkpoint, start(count), parts=parts)
         except StaleError:
@@ -328,7 +333,7 @@ def _score_views(gaussians: Gaussians, cameras: Camera, images, valid, config: F
         camera, image, counted = view
         rgb = render(gaussians, camera, config.render, background=config.background, outputs=("rgb",)).rgb
         assert rgb is not None
-        corrected = ()
+        corrected: Any = ()
         if config.exposure_rate:
             gained = jnp.clip(rgb * fit_gains(rgb, image, valid=counted), 0, 1)
             corrected = psnr(gained, image, valid=counted)

@@ -62,7 +62,6 @@ class FitConfig(eqx.Module):
     full_size_from: float = static_field(default=0.3, limits=Limits(0, 1))  # share of the steps
     # of the centres, times the extent of the points; decays to a hundredth
     means_rate: float = static_field(default=4e-4, limits=Limits(0, 1e3))
-    far_rates: bool = static_field(default=False)
     # of the logarithms of the scales
     scales_rate: float = static_field(default=1e-2, limits=Limits(0, 1e3))
     # of the quaternions
@@ -235,9 +234,6 @@ def train_steps(state: FitState, cameras: Camera, photos: Photos, config: FitCon
         value, (gradient, view_gradient) = eqx.filter_value_and_grad(loss)((state.gaussians, state.per_view))
         updates, moments = optimizers[0].update(gradient, state.optimizer, state.gaussians)
         updates = eqx.tree_at(lambda g: g.sh, updates, updates.sh * _band_rates(state.step, config))
-        if config.far_rates:
-            reach = jnp.linalg.norm(state.gaussians.means - jnp.mean(cameras.position, 0), axis=1) / extent
-            updates = eqx.tree_at(lambda g: g.means, updates, updates.means * jnp.maximum(reach, 1.0)[:, None])
         gaussians = optax.apply_updates(state.gaussians, updates)
         if config.noise:
             gaussians = shake(gaussians, key, noise_at(state.step, config, extent))

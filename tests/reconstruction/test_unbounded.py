@@ -1,5 +1,6 @@
 """Captures without bounds: exposure of photos, a far shell, photos of growing size, relocation by error, the budget."""
 
+import re
 from dataclasses import replace
 
 import jax
@@ -10,11 +11,24 @@ from shapes import make_gaussians
 
 from pigjax import io
 from pigjax.core.camera import orbit, project
+from pigjax.core.errors import InputError
 from pigjax.reconstruction.exposure import fit_gains, gains_of
 from pigjax.reconstruction.init import far_shell
 from pigjax.reconstruction.mcmc import relocate
 from pigjax.reconstruction.reconstruct import FitConfig, reconstruct
-from pigjax.reconstruction.train import Photos, halved, halvings_at, size_steps, splat_budget, with_budget
+from pigjax.reconstruction.train import (
+    FitState,
+    Photos,
+    halved,
+    halvings_at,
+    optimizer_of,
+    size_steps,
+    splat_budget,
+    start_per_view,
+    train_steps,
+    view_optimizer_of,
+    with_budget,
+)
 from pigjax.splat import render
 
 CAMERAS = orbit((0.0, 0.0, 0.0), radius=2.5, elevation=0.4, frames=8, focal=30.0, width=32, height=24)
@@ -110,7 +124,7 @@ def test_the_budget_follows_the_pixels_of_the_photos():
 
 
 def test_known_exposures_are_recovered_and_held_out_photos_scored_apart_from_theirs():
-    """Photos of one scene, each with gains of its own; in training the sizes, the shell and relocation by error too."""
+    """Photos of one scene, each with gains of its own."""
     rng = np.random.default_rng(1)
     truth = make_gaussians(rng.normal(0, 0.3, (30, 3)), scales=0.15, opacity=0.8)
     truth = replace(truth, sh=jnp.asarray(rng.normal(0, 0.3, (30, 1, 3)), jnp.float32))
@@ -122,7 +136,7 @@ def test_known_exposures_are_recovered_and_held_out_photos_scored_apart_from_the
     views = io.Views(CAMERAS, tuple("abcdefgh"), np.asarray(photos), None, splits)
     config = FitConfig(
         steps=150, splats=100, sh_degree=0, background=0.3, evaluate_every=150, relocate_every=50, exposure_rate=0.02,
-        halvings=1, full_size_from=0.2, error_views=2, shell=0.0,
+        halvings=0, error_views=2,
     )  # fmt: skip
     result = reconstruct(views, config, points=(np.asarray(truth.means), np.full((30, 3), 0.5)))
     wanted = np.asarray(gains_of(jnp.log(gains[1:7])))
@@ -131,3 +145,33 @@ def test_known_exposures_are_recovered_and_held_out_photos_scored_apart_from_the
     assert error.mean() < 0.25 * np.log(wanted).std()
     assert set(result.corrected_psnr) == {"a", "h"}
     assert np.mean(list(result.corrected_psnr.values())) > result.mean_psnr + 0.5
+
+
+def test_a_shell_behind_masks_is_refused():
+    masks = np.ones((8, 24, 32), int)
+    views = io.Views(CAMERAS, tuple("abcdefgh"), np.zeros((8, 24, 32, 3)), masks, ("train",) * 8)
+    with pytest.raises(InputError, match=r"shell = 0\.1: masks leave the background out"):
+        reconstruct(views, FitConfig(shell=0.1, object_id=1), points=(np.zeros((9, 3)), np.zeros((9, 3))))
+
+
+def test_only_what_is_fitted_is_traced():
+    """Without gains the state has none, and options that act before and between the steps leave the step as it is."""
+    images = jnp.zeros((8, 24, 32, 3))
+
+    def step(**options):
+        config = FitConfig(splats=9, sh_degree=0, **options)
+        optimizers = optimizer_of(config, 1.0), view_optimizer_of(config)
+        gaussians = make_gaussians(np.zeros((9, 3)))
+        per_view, zero = start_per_view(8, config), jnp.zeros((), jnp.int32)
+        state = FitState(gaussians, optimizers[0].init(gaussians), per_view, optimizers[1].init(per_view), zero, zero)
+        traced = jax.make_jaxpr(
+            lambda state: train_steps.__wrapped__(state, CAMERAS, Photos(images, None), config, optimizers, 1.0, 1)
+        )(state)
+        return re.sub(r"0x[0-9a-f]+", "", str(traced)), per_view
+
+    plain, nothing = step()
+    assert nothing == {}
+    assert step(halvings=2, shell=0.5, error_views=3)[0] == plain
+    gained, per_view = step(exposure_rate=0.01)
+    assert set(per_view) == {"exposures"}
+    assert gained != plain
