@@ -71,6 +71,9 @@ def reconstruct(
     error_views: Annotated[
         int, typer.Option(help="Photos whose errors draw Gaussians before a relocation; 0: by opacity.", min=0)
     ] = 0,
+    antialias: Annotated[
+        bool, typer.Option(help="Opacities follow the dilation, as in Mip-Splatting; draw with antialias=True.")
+    ] = False,
     refine_poses: Annotated[bool, typer.Option(help="Correct training cameras, into OUT/poses.json.")] = False,
     previews: Annotated[int, typer.Option(help="Steps between preview pictures; 0 for none.", min=0)] = 0,
     seed: int = 0,
@@ -119,7 +122,7 @@ def reconstruct(
         error_views=error_views,
         preview_every=previews,
         seed=seed,
-        render=RenderConfig(bands=jax.local_device_count()),
+        render=RenderConfig(bands=jax.local_device_count(), antialias=antialias),
     )
     if out is None:
         out = Path(f"reconstruction-{_name_of(views)}")
