@@ -31,6 +31,7 @@ from pigjax.reconstruction.train import (
     FitConfig,
     FitState,
     Photos,
+    corrected_cameras,
     count_at,
     grow,
     halved,
@@ -40,7 +41,6 @@ from pigjax.reconstruction.train import (
     size_steps,
     start_per_view,
     train_steps,
-    twist_of,
     view_optimizer_of,
     with_budget,
 )
@@ -161,12 +161,12 @@ def reconstruct(
             size = halvings_at(step, config)
             cameras, small = replicate(halved(train.cameras, photos, size), shards)
         if (count := count_at(step, config)) > len(state.gaussians):
-            state = grow(state, count, config, cameras, small)
+            state = grow(state, count, config, corrected_cameras(cameras, state, extent), small)
         stop = min(config.steps, _next_stop(step, config))
         state, loss = train_steps(state, cameras, small, config, optimizers, extent, jnp.asarray(stop - step))
         state = replicate(state, shards)
         if config.relocate_every and stop % config.relocate_every == 0 and stop <= config.relocate_until * config.steps:
-            state = relocate_dead(state, config, cameras, small)
+            state = relocate_dead(state, config, corrected_cameras(cameras, state, extent), small)
         psnrs: dict[str, float] = {}
         ssims: dict[str, float] = {}
         if stop % config.evaluate_every == 0 or stop == config.steps:
@@ -180,16 +180,14 @@ def reconstruct(
         if callback is not None:
             callback(result.history[-1])
     psnrs, ssims, corrected = _score(state.gaussians, scored, config)
-    per_view = state.per_view
-    poses = per_view.get("poses")
     return replace(
         result,
         gaussians=state.gaussians,
         psnr=psnrs,
         ssim=ssims,
         corrected_psnr=corrected,
-        cameras=train.cameras if poses is None else train.cameras.nudged(twist_of(poses, extent)),
-        gains=gains_of(per_view["exposures"]) if "exposures" in per_view else None,
+        cameras=corrected_cameras(train.cameras, state, extent),
+        gains=gains_of(state.per_view["exposures"]) if "exposures" in state.per_view else None,
         relocated=int(state.relocated),
     )
 

@@ -227,7 +227,9 @@ def train_steps(state: FitState, cameras: Camera, photos: Photos, config: FitCon
         def loss(fitted):
             gaussians, per_view = fitted
             photo = jax.tree.map(lambda array: array[view], photos)
-            camera = _corrected(cameras[view], per_view, view, extent)
+            camera = cameras[view]
+            if "poses" in per_view:
+                camera = camera.nudged(twist_of(per_view["poses"][view], extent))
             gains = gains_of(per_view["exposures"])[view] if "exposures" in per_view else None
             return _loss(gaussians, camera, gains, photo, background, config, extent)
 
@@ -250,11 +252,6 @@ def train_steps(state: FitState, cameras: Camera, photos: Photos, config: FitCon
 
     state, total = lax.fori_loop(0, count, one, (state, jnp.zeros(())))
     return state, total / count
-
-
-def _corrected(camera: Camera, per_view, view, extent: float) -> Camera:
-    """The camera of a photo as its pose was corrected."""
-    return camera.nudged(twist_of(per_view["poses"][view], extent)) if "poses" in per_view else camera
 
 
 def _loss(gaussians: Gaussians, camera: Camera, gains, photo: Photos, background, config: FitConfig, extent: float):
@@ -306,6 +303,12 @@ def halvings_at(step: int, config: FitConfig) -> int:
     return sum(step < start for start in size_steps(config))
 
 
+def corrected_cameras(cameras: Camera, state: FitState, extent: float) -> Camera:
+    """Cameras of the photos with the poses that were fitted."""
+    poses = state.per_view.get("poses")
+    return cameras if poses is None else cameras.nudged(twist_of(poses, extent))
+
+
 def twist_of(poses: Float[Array, "*v 6"], extent: float) -> Float[Array, "*v 6"]:
     """Pose corrections as `Camera.nudged` takes them; translations are learnt in units of the extent [m]."""
     return poses * jnp.asarray([1.0, 1.0, 1.0, extent, extent, extent])
@@ -320,7 +323,7 @@ def relocate_dead(
     Args:
         state: before.
         config: settings.
-        cameras: training views, for relocation by error; None: by opacity alone.
+        cameras: training views as corrected, for relocation by error; None: by opacity alone.
         photos: of these views.
     """
     key = jax.random.fold_in(jax.random.key(config.seed + 2), state.step)
@@ -363,7 +366,10 @@ def _errors(state: FitState, cameras: Camera, photos: Photos, config: FitConfig,
 
 
 def grow(state: FitState, count: int, config: FitConfig, cameras: Camera, photos: Photos) -> FitState:
-    """State with `count` Gaussians: dead ones are added and relocated at once. Their moments start from 0."""
+    """State with `count` Gaussians: dead ones are added and relocated at once. Their moments start from 0.
+
+    Cameras and photos are those of `relocate_dead`.
+    """
     old = len(state.gaussians)
 
     def longer(leaf):
