@@ -36,7 +36,7 @@ ARGUMENTS = [
     *("--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update"),
     "--disable-sync",
 ]
-# what viser's page itself says: a quad of two coordinates, of which three.js wants a sphere around it, and a listener of
+# what the page of viser itself says: a quad of two coordinates, of which three.js wants a sphere, and a listener of
 # the mouse that the browser makes passive
 KNOWN = (
     "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN",
