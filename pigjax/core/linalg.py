@@ -116,17 +116,38 @@ def inv3(matrix: Matrices) -> Matrices:
 
 def safe_norm(vector: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
     """Euclidean norm without over- or underflow of the squares; its derivative at zero is zero."""
-    scale = _power_of_two(jnp.abs(vector).max(axis))
-    squared = jnp.square(vector / jnp.expand_dims(scale, axis)).sum(axis)
-    positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0) * scale
+    scale, _, norm = _scaled_norm(vector, axis)
+    return norm * scale
 
 
 def safe_normalize(vector: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
     """Unit vector of the same direction; zero, with a zero derivative, where the vector is zero."""
-    norm = jnp.expand_dims(safe_norm(vector, axis), axis)
+    # of the scaled vector, since the derivative of a quotient has the square of the divisor
+    _, scaled, norm = _scaled_norm(vector, axis)
+    norm = jnp.expand_dims(norm, axis)
     positive = norm > 0
-    return jnp.where(positive, vector / jnp.where(positive, norm, 1.0), 0.0)
+    return jnp.where(positive, scaled / jnp.where(positive, norm, 1.0), 0.0)
+
+
+def safe_ratio(part: Float[Array, "..."], whole: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Quotient part / whole where `whole` > 0, else `part`, with derivatives down to the smallest numbers.
+
+    The derivative of a plain quotient has whole², which underflows below 1e-19 in float32.
+    """
+    usable = whole > 0
+    scale = _power_of_two(jnp.where(usable, whole, 1.0))
+    return (part / scale) / jnp.where(usable, whole / scale, 1.0)
+
+
+def _scaled_norm(
+    vector: Float[Array, "..."], axis: int
+) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+    """Power of two taken out of a vector, the vector over it, whose squares are in range, and the norm of that."""
+    scale = _power_of_two(jnp.abs(vector).max(axis))
+    scaled = vector / jnp.expand_dims(scale, axis)
+    squared = jnp.square(scaled).sum(axis)
+    positive = squared > 0
+    return scale, scaled, jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
 
 
 def quat_to_matrix(quats: Quaternions) -> Matrices:
