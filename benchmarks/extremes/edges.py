@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.extremes.judging import COUNTED, FAULT, FINITE, Outcome, not_finite, outcome
+from benchmarks.extremes.judging import BEYOND, COUNTED, FAULT, FINITE, Outcome, not_finite, outcome
 from benchmarks.extremes.leaves import QUATS, STRETCHES, WORLD
 from pigjax.clamp import ClampParams, clamped_shapes
 from pigjax.core.camera import Camera, look_at, stack_cameras
@@ -30,6 +30,7 @@ FAR = (1.0, 1e3, 1e4, 1e5, 1e6, 1e7)
 # Drawing.
 
 COUNT, WIDTH, HEIGHT = 12, 20, 16
+MOST_LOG_SCALE = float(np.log(1e15))  # no number of a scene is larger; squares of larger ones overflow float32
 EYE = np.array([1.2, -2.0, 1.0])
 
 
@@ -68,6 +69,8 @@ def draw(camera: Camera, parts: dict[str, np.ndarray]) -> Any:
     """A picture, and the gradient of a loss of it; where an input is not finite, the picture alone."""
     gaussians = Gaussians(**{name: jnp.asarray(part, jnp.float32) for name, part in parts.items()})
     picture, slopes = _drawn(gaussians, jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), camera))
+    if float(np.max(gaussians.log_scales)) > MOST_LOG_SCALE and not not_finite(gaussians):
+        return picture if not_finite(picture) or not not_finite(slopes) else Outcome(BEYOND, "no gradient")
     return picture if not_finite(gaussians) else (picture, slopes)
 
 
@@ -352,7 +355,7 @@ def searches() -> dict[str, Case]:
 
 
 SUBJECTS: dict[str, tuple[Callable[[], dict[str, Case]], str]] = {
-    "drawing": (drawing, "splats that are no numbers are not drawn; harmonics must be finite, at most 1e15"),
+    "drawing": (drawing, "splats that are no numbers are not drawn; gradients up to scales of 1e15 m"),
     "large pictures": (large, "memory: about 0.4 kB for each Gaussian, 60 B for each pixel"),
     "clamp": (clamp, "weights from -1e3 to 1e3, bounds from 0 to 1e9 with tau_min <= tau_max"),
     "votes": (votes, "thresholds in [0, 1]; ids up to the memory of [n ids] counts"),

@@ -146,7 +146,7 @@ def rests(laws: Any, steps: int) -> dict[str, Case]:
 
 
 def twice(laws: Any) -> dict[str, Case]:
-    """Two runs, the second in a program of its own, end with the same bits."""
+    """Two runs end with the same bits."""
 
     def judged(law):
         table = table_of(law)

@@ -19,17 +19,17 @@ SAMPLE = ("neo_hookean", "drucker_prager", "fluid")
 
 
 def leaf_functions(options):
-    """A line for each function and precision, with the scales at which it is finite."""
+    """A line for each function, with the scales between which it was finite."""
     rows = []
-    for group in leaves.GROUPS.values():
-        for name, leaf in group.items():
-            for precision in leaves.PRECISIONS:
-                found = leaves.judged(leaf, precision)
-                scales = leaves.float_range(precision) if leaf.scales is None else leaf.scales
-                fine = np.reshape([o.kind == FINITE for o in found], (len(scales), -1)).all(1)
-                span = scales[fine]
-                told = f"{span[0]:.3g} to {span[-1]:.3g}: {leaf.why}" if fine.any() else leaf.why
-                rows.append((f"{name}, {np.dtype(precision).name}", found, told))
+    for name, leaf in leaves.LEAVES.items():
+        found, spans = [], []
+        for precision in leaves.PRECISIONS:
+            own = leaves.judged(leaf, precision)
+            scales = leaves.float_range(precision) if leaf.scales is None else leaf.scales
+            fine = scales[np.reshape([o.kind == FINITE for o in own], (len(scales), -1)).all(1)]
+            spans.append(f"{fine[0]:.3g} to {fine[-1]:.3g}" if len(fine) else "none")
+            found += own
+        rows.append((name, found, f"{spans[0]}; float64 {spans[1]}: {leaf.why}"))
     end(rows)
 
 

@@ -19,11 +19,11 @@ def test_errors_are_no_larger_than_stored(name):
 
 
 def test_a_program_more_and_a_larger_error_are_found():
-    before = {"programs": {"render": 0}, "accuracy": {"picture": 1e-6}}
+    before = {"programs": {"render": 0}, "accuracy": {"picture": 1e-6, "turn": 1e-9}}
     assert guard.worse({"render": 1}, {"picture": 1e-6}, before) == ["render"]
-    assert guard.worse({"render": 0}, {"picture": 1.3e-6}, before) == ["picture"]
+    assert guard.worse({"render": 0}, {"picture": 4.1e-6, "turn": 9e-7}, before) == ["picture"]
     assert guard.worse({"render": 0}, {"picture": float("nan")}, before) == ["picture"]
-    assert not guard.worse({"render": 0, "new": 3}, {"picture": 1.2e-6, "new": 1.0}, before)
+    assert not guard.worse({"render": 0, "new": 3}, {"picture": 3.9e-6, "new": 1.0}, before)
 
 
 def test_timings_that_are_far_off_are_told():
