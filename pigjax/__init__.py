@@ -14,6 +14,7 @@ from pigjax.core.placing import as_gaussians, placed
 from pigjax.core.regions import BoxRegion, HalfSpace, SphereRegion
 from pigjax.core.upright import Upright, find_up
 from pigjax.coupling.binding import at_frame, bind, deform
+from pigjax.coupling.hidden import fill_hidden
 from pigjax.coupling.outliers import cut_outliers
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
@@ -33,6 +34,7 @@ from pigjax.io import (
 )
 from pigjax.mls_mpm import SimConfig, rollout, step
 from pigjax.mpm import Grid, Health, Particles, Trajectory, fit_grid, make_particles, vast_grid
+from pigjax.mpm.active_grid import choose_box
 from pigjax.mpm.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.forces import Force, ForceField, Impulse, Spring, Wind, grab
@@ -111,6 +113,7 @@ __all__ = [
     "at_frame",
     "bind",
     "boundary_iou",
+    "choose_box",
     "choose_integrator",
     "choose_substeps",
     "collider_from_gaussians",
@@ -123,6 +126,7 @@ __all__ = [
     "experiment",
     "export_run",
     "extract_object",
+    "fill_hidden",
     "fill_unseen",
     "find_up",
     "fit",

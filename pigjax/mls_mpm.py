@@ -46,6 +46,7 @@ from pigjax.core.arrays import is_known
 from pigjax.core.errors import InputError
 from pigjax.core.regions import Region
 from pigjax.mpm import Grid, Health, Particles, SimConfig, StepHealth, Trajectory
+from pigjax.mpm.active_grid import choose_box
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact, broken_by
 from pigjax.mpm.forces import Force, check_forces
@@ -65,8 +66,9 @@ from pigjax.mpm.timestep import (
     substep_rule,
 )
 
-__all__ = ["SimConfig", "choose_integrator", "choose_substeps", "rollout", "stable_dt", "step"]
+__all__ = ["SimConfig", "choose_box", "choose_integrator", "choose_substeps", "rollout", "stable_dt", "step"]
 _SMALL = 50_000  # nodes of a domain that is held whole: less than other costs of a step
+_EMPTY = 32  # nodes a particle, of which matter fills at most a few
 _UNDECIDED = (
     "is traced by jit, grad or vmap and cannot choose its integrator: give SimConfig one, or what choose_integrator"
     " finds from concrete values."
@@ -150,9 +152,9 @@ def rollout(
 
     With concrete arrays, only the active part of the grid is allocated; a domain of at most 50,000 nodes is held whole
     unless `sleep` is given. Inside jit, grad and vmap the whole grid is allocated, or a window of `config.box` nodes
-    that moves with matter: give a grid that `fit_grid` has fitted. Reverse mode keeps O(√n) checkpoints of n steps, at
-    least one for each frame, and recomputes the states between them (Griewank and Walther 2000); with a window it also
-    keeps the inputs of each frame.
+    that moves with matter (`choose_box` finds it): give a grid that `fit_grid` has fitted. Reverse mode keeps O(√n)
+    checkpoints of n steps, at least one for each frame, and recomputes the states between them (Griewank and Walther
+    2000); with a window it also keeps the inputs of each frame.
 
     Args:
         particles: p of them, in any order of materials.
@@ -196,6 +198,7 @@ def rollout(
             )
         if config.integrator == "auto":
             raise InputError(f"rollout {_UNDECIDED}")
+        _warn_of_empty_nodes(grid, len(particles), config)
         dt = jnp.asarray(frame_dt) / config.substeps
         return _compiled(
             particles, grid, table, config, dt, gravity, colliders, contact, pins, forces, frames, config.substeps
@@ -263,6 +266,18 @@ def _compiled(
     dt, gravity, grid, table, colliders, contact, pins, forces = _like(numbers, particles)
     inputs = StepInputs(dt, substeps, gravity, jnp.zeros_like(dt), colliders, contact, pins, forces)
     return simulate_compiled(particles, grid, table, config, inputs, frames=frames)
+
+
+def _warn_of_empty_nodes(grid: Grid, particles: int, config: SimConfig) -> None:
+    """Warn where a traced rollout visits many more nodes than matter can fill."""
+    nodes = math.prod(grid.shape)
+    if config.box is None and nodes > max(_SMALL, _EMPTY * particles):
+        warnings.warn(
+            f"rollout is traced by jit, grad or vmap and visits all {nodes} nodes of its grid in each step, for"
+            f" {particles} particles: give SimConfig the box that choose_box finds from one rollout outside, or fit the"
+            " grid with fit_grid.",
+            stacklevel=3,
+        )
 
 
 def _like(tree: Any, particles: Particles) -> Any:

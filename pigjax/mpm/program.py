@@ -51,7 +51,7 @@ from pigjax.mpm.substep import (
 )
 from pigjax.mpm.transfers import KERNELS
 
-_AXIS = "particles"
+AXIS = "particles"
 
 
 class GridWindow(eqx.Module):
@@ -150,7 +150,7 @@ def run_frames(
         newton_steps=config.newton_steps,
         newton_tolerance=config.newton_tolerance,
         krylov_steps=config.krylov_steps,
-        axis=_AXIS if devices > 1 else None,
+        axis=AXIS if devices > 1 else None,
         fillers=sum(-len(part) % devices for part, moves in zip(grouping.parts, grouping.moves) if moves),
         force_columns=columns_of(inputs.forces),
         warp=warp,
@@ -158,13 +158,13 @@ def run_frames(
     )
     run = partial(_frames, statics, config, frames, inputs.substeps, of or frames)
     if devices > 1:
-        whole, shared = PartitionSpec(), PartitionSpec(_AXIS)
-        mesh = Mesh(np.array(jax.local_devices()[:devices]), (_AXIS,))
+        whole, shared = PartitionSpec(), PartitionSpec(AXIS)
+        mesh = Mesh(np.array(jax.local_devices()[:devices]), (AXIS,))
         run = jax.shard_map(
             run,
             mesh=mesh,
             in_specs=(whole, shared, whole),
-            out_specs=(shared, PartitionSpec(None, _AXIS), whole),
+            out_specs=(shared, PartitionSpec(None, AXIS), whole),
             check_vma=False,  # of loops whose carries would need marks
         )
     states, paths, (health, sides_met) = run(context, states, inputs.start)

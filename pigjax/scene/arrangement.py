@@ -1,4 +1,4 @@
-"""Objects of a scene where its file puts them: moved, turned, scaled, copied, removed, or from files of their own."""
+"""Objects of a scene as its file has them: filled, moved, turned, scaled, copied, removed, from files of their own."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ from pigjax.core.checks import joined
 from pigjax.core.errors import SceneError
 from pigjax.core.extent import scene_extent
 from pigjax.core.placing import placed
+from pigjax.coupling.hidden import fill_hidden
 from pigjax.scene.plan import Inputs, with_id
 from pigjax.scene.schema import ObjectSpec, Scene
+from pigjax.scene.world import axis_of
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians
 
@@ -32,6 +34,7 @@ def arrange(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs
     Raises:
         SceneError: an object's name is that of a copy.
     """
+    inputs, labels = _filled(scene, inputs, labels)
     if not any(entry.is_placed for entry in scene.objects.values()):
         return scene, inputs, labels
     scene, inputs, labels = _without_removed(scene, inputs, labels)
@@ -67,6 +70,28 @@ def arrange(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs
     everything = jax.tree.map(lambda *columns: jnp.concatenate(columns), base, *parts)
     labels = _extended(labels, [len(part) for part in parts], owners)
     return with_fields(scene, objects=objects), replace(inputs, gaussians=everything, ids=ids, arranged=True), labels
+
+
+def _filled(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Inputs, Labels]:
+    """Inputs and labels with the surfaces closed that objects hid which do not stay."""
+    hiding = [inputs.ids[name] for name, entry in scene.objects.items() if not entry.fixed]
+    eyes = None if inputs.views is None else np.asarray(inputs.views.training.cameras.position, np.float64)
+    for name, entry in scene.objects.items():
+        if not entry.fill:
+            continue
+        found = fill_hidden(
+            inputs.gaussians,
+            labels,
+            inputs.ids[name],
+            hidden_by=hiding,
+            up=axis_of(scene.input.up),
+            eyes=eyes,
+            name=joined("objects", name),
+        )
+        counts = {"added": found.added, "recoloured": found.recoloured}
+        inputs = replace(inputs, gaussians=found.gaussians, arranged=True, filled={**inputs.filled, name: counts})
+        labels = found.labels
+    return inputs, labels
 
 
 def _without_removed(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs, Labels]:

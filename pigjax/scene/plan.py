@@ -57,7 +57,8 @@ class Inputs:
     own: dict[str, Gaussians] = field(default_factory=dict)  # of the objects that have a file of their own
     world: Float[np.ndarray, "4 4"] | None = None  # transform from the files; None: none
     labels: Labels | None = None  # where the scale of the world needed them
-    arranged: bool = False  # whether objects were placed, copied or removed
+    arranged: bool = False  # whether objects were placed, copied, removed or filled
+    filled: dict[str, dict[str, int]] = field(default_factory=dict)  # Gaussians "added" and "recoloured", by object
 
     @property
     def moved(self) -> bool:
@@ -356,7 +357,9 @@ def _still_solids(scene: Scene, inputs: Inputs, labels: Labels, dx: float) -> di
     for name, entry in scene.objects.items():
         if entry.fixed:
             members = np.flatnonzero(object_id == inputs.ids[name])
-            own = jax.tree.map(lambda values, members=members: values[members], inputs.gaussians)
+            own = jax.tree.map(
+                lambda values, members=members: jnp.asarray(np.asarray(values)[members]), inputs.gaussians
+            )
             solids[name] = collider_from_gaussians(
                 own,
                 spacing=dx / 2,
@@ -393,8 +396,9 @@ def _without_buried(inputs: Inputs, labels: Labels, solids: dict[str, Collider],
     a collider could only be stuck.
     """
     for name, solid in solids.items():
-        buried = solid.distance(inputs.gaussians.means) < -0.25 * dx
-        labels = replace(labels, object_id=jnp.where(buried, inputs.ids[name], labels.object_id))
+        buried = solid.distances_of(inputs.gaussians.means) < -0.25 * dx
+        object_id = np.where(buried, inputs.ids[name], np.asarray(labels.object_id))
+        labels = replace(labels, object_id=jnp.asarray(object_id, jnp.int32))
     return labels
 
 

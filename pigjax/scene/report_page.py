@@ -93,7 +93,10 @@ def left_out(scene: Scene, report: RunReport) -> list[str]:
     found.append(f"Light: {light}")
     if scene.clamp.mode == "fixed":
         found.append('The stretch of splats, which keep their rest shape (clamp.mode = "fixed").')
-    found.append("New splats: none is split or added, so places that no photo saw stay empty.")
+    if not any(entry.fill for entry in scene.objects.values()):
+        found.append(
+            "Places that no photo saw: they stay empty (objects.NAME.fill closes a fixed object's surface there)."
+        )
     if count := report.sizes.get("gaussians_without_particle"):
         found.append(f"Particles of {count} Gaussians, which are carried by their neighbours.")
     found.append("Elastic energy in the curves below.")

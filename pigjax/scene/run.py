@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -153,6 +156,7 @@ def _run(
     prediction = _predict(scene, inputs, plan, stages, report, planned)
     say(report.plan)
     told = say if planned is not None else None
+    pictures = _Pictures.of(scene, inputs, plan)
     states = _simulate(scene, plan, stages, out / "states", parts, key, report, tell, told, prediction)
     followed = None
     if frames := min(scene.output.error_frames, scene.simulation.frames):
@@ -163,7 +167,7 @@ def _run(
             for _ in states:
                 pass
     with report.stage("draw"):
-        _draw(scene, inputs, plan, labels, out, key, report, tell, states)
+        _draw(scene, inputs, plan, labels, pictures, out, key, report, tell, states)
     if followed is not None:
         with report.stage("estimate"):
             tell("estimate", 0, 1)
@@ -238,6 +242,8 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
         "dx": plan.dx,
         "mass_kg": float(plan.particles.mass.sum()),
     }
+    if inputs.filled:
+        report.sizes["filled"] = inputs.filled
 
 
 def _particles_of(
@@ -349,11 +355,40 @@ def _checkpoint(path: Path, frame: int, particles: Particles, active: ActiveGrid
     io.save_pytree(path, (np.asarray(frame), particles, active.memory()), parts=parts)
 
 
+class _Pictures(NamedTuple):
+    """The cameras of all frames, and the program that poses and renders one, compiled beside the simulation."""
+
+    cameras: Camera
+    program: Future[Any]  # (gaussians, particles, binding, camera): picture, and largest stretch of each splat
+
+    @classmethod
+    def of(cls, scene: Scene, inputs: Inputs, plan: Plan) -> _Pictures:
+        """Begin to compile."""
+        matter = np.asarray(plan.particles.x)
+        cameras = make_cameras(scene, inputs, matter.mean(0), matter)
+        background, config = jnp.asarray(scene.camera.background), render_config(scene)
+
+        # everything large comes in as an argument: XLA would fold constants for minutes
+        @jax.jit
+        def pose_and_render(gaussians: Gaussians, particles: Particles, binding: Any, camera: Camera):
+            splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
+            frame = render(splats, camera, config, background=background, outputs=("rgb",))
+            longest = safe_norm(splats.factors, axis=1) / jnp.exp(gaussians.log_scales)  # of each axis, over rest
+            return jnp.clip(frame.rgb, 0, 1), longest.max(1)
+
+        traced = pose_and_render.lower(inputs.gaussians, plan.particles, plan.binding, cameras[0])
+        compiler = ThreadPoolExecutor(1)
+        program = compiler.submit(traced.compile)
+        compiler.shutdown(wait=False)
+        return cls(cameras, program)
+
+
 def _draw(
     scene: Scene,
     inputs: Inputs,
     plan: Plan,
     labels: Labels,
+    drawn: _Pictures,
     out: Path,
     key: str,
     report: RunReport,
@@ -362,23 +397,20 @@ def _draw(
 ) -> None:
     """Pose and render each saved state, once `states` says that it is there; remove it where it is not to be kept."""
     frames, gaussians = scene.simulation.frames, inputs.gaussians
-    matter = np.asarray(plan.particles.x)
-    cameras = make_cameras(scene, inputs, matter.mean(0), matter)
-    background = jnp.asarray(scene.camera.background)
-    config = render_config(scene)
-
-    # everything large comes in as an argument: XLA would fold constants for minutes
-    @jax.jit
-    def pose_and_render(gaussians: Gaussians, particles: Particles, binding, camera: Camera):
-        splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
-        frame = render(splats, camera, config, background=background, outputs=("rgb",))
-        longest = safe_norm(splats.factors, axis=1) / jnp.exp(gaussians.log_scales)  # of each axis, relative to rest
-        return jnp.clip(frame.rgb, 0, 1), longest.max(1)
+    cameras = drawn.cameras
 
     def draw(frame: int) -> tuple[jax.Array, jax.Array]:
         state = io.load_state(out / "states", frame, signature=key)
-        particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, (state["x"], state["F_visual"]))
-        return pose_and_render(gaussians, particles, plan.binding, cameras[frame])
+        there = tuple(np.asarray(state[name], plan.particles.x.dtype) for name in ("x", "F_visual"))
+        particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, there)
+        return program()(gaussians, particles, plan.binding, cameras[frame])
+
+    def program() -> Any:
+        """The compiled program; time spent waiting for it counts as compiling."""
+        begun = time.perf_counter()
+        compiled = drawn.program.result()
+        report.times["draw"].compile += time.perf_counter() - begun
+        return compiled
 
     sheet_frames = np.unique(np.linspace(0, frames, _SHEET_FRAMES).round().astype(int))
     sheet: list[np.ndarray] = []

@@ -80,7 +80,8 @@ class SimulationSpec(Section, frozen=True):
     slow_motion: Annotated[float, Limits(0, 1e9, above=True)] = 1.0  # simulated time is shown this many times slower
     particles_per_cell: Annotated[float, Limits(0, 1e4, above=True)] = 8.0
     fill: bool = True  # fill objects inside
-    cfl: Annotated[float, Limits(0, 1, above=True)] = 0.4
+    # cells a step; error hardly depends on it, and fluids break down above 0.8
+    cfl: Annotated[float, Limits(0, 1, above=True)] = 0.6
     kernel: Literal["quadratic", "cubic"] = "quadratic"
     integrator: Literal["explicit", "implicit", "auto"] = "explicit"
     # of objects on each other, which then never fuse; None: one common field
@@ -176,6 +177,7 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     removed: bool = False  # its splats are left out, as if it had never stood there
     fixed: bool = False  # a still collider made from its own splats
     friction: Annotated[float, _FRICTION] = 0.5  # Coulomb's coefficient of a fixed object
+    fill: bool = False  # close the surface of a fixed object where those that move or are removed hid it
     material: str | None = None
     model: str | None = None
     velocity: Annotated[Triple, _SPEED] = (0.0, 0.0, 0.0)
@@ -212,6 +214,8 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
             for name in ("velocity", "angular_velocity"):
                 yield name, not any(getattr(self, name)), "a fixed object does not move; remove one of the two"
             yield "start", self.start == 0, "a fixed object does not move; remove one of the two"
+        yield "fill", self.fixed or not self.fill, "only a fixed object is filled; give fixed = true, or remove it"
+        yield "fill", self.gaussians is None or not self.fill, "nothing hid an object from a file of its own; remove it"
         both = self.gaussians is not None and (self.within is not None or self.id is not None)
         yield "gaussians", not both, "a file of its own needs no id and no region; remove one of the two"
 

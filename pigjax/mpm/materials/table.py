@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import fields
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -111,6 +112,7 @@ class MaterialTable(Parameters):
         return Parameters(**{f.name: getattr(self, f.name)[index] for f in fields(Parameters)})
 
     @property
+    @partial(jax.jit, inline=True)
     def wave_speed(self) -> Float[Array, "m"]:
         """Speed of pressure waves [m/s] at small stretches, √(M/ρ); 0 where matter never moves.
 
