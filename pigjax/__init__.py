@@ -20,6 +20,7 @@ from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
 from pigjax.io import (
     Views,
+    example_folder,
     load_dataset,
     load_gaussians,
     load_masks,
@@ -123,6 +124,7 @@ __all__ = [
     "deform",
     "eigen_clamp",
     "evaluate_labels",
+    "example_folder",
     "experiment",
     "export_run",
     "extract_object",
@@ -184,3 +186,8 @@ __all__ = [
     "vast_grid",
     "write_video",
 ]
+
+
+def __dir__() -> list[str]:
+    """The public names alone, for completion and `dir`; subpackages are imported by their path."""
+    return sorted(__all__)

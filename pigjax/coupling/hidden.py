@@ -271,7 +271,7 @@ def _tangents(normals: Float[np.ndarray, "q 3"]) -> tuple[Float[np.ndarray, "q 3
 
 
 def _near(shell: Shell, patch: _Patch) -> _Near:
-    gaps, nodes = cKDTree(patch.nodes).query(shell.means, k=min(_LINKS, len(patch.nodes)))
+    gaps, nodes = cKDTree(patch.nodes).query(shell.means, k=min(2 * _LINKS, len(patch.nodes)))
     gaps, nodes = gaps.reshape(len(shell.means), -1), nodes.reshape(len(shell.means), -1)
     node = nodes[:, 0]
     offset = shell.means - patch.nodes[node]

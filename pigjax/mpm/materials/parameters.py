@@ -27,8 +27,8 @@ class Parameters(eqx.Module):
     yield_stress: Float[Array, "*m"] = _number(default=0.0)  # uniaxial [Pa]
     hardening_modulus: Float[Array, "*m"] = _number(default=0.0)  # rise of the yield stress by plastic strain [Pa]
     residual_stress: Float[Array, "*m"] = _number(default=0.0)  # the yield stress softens no further [Pa]
-    friction_angle: Float[Array, "*m"] = _number(default=0.0)  # [rad]
-    cohesion: Float[Array, "*m"] = _number(default=0.0)  # [Pa]
+    friction_angle: Float[Array, "*m"] = _number(default=0.0)  # of sand, about that of its steepest slope [rad]
+    cohesion: Float[Array, "*m"] = _number(default=0.0)  # of sand: shear strength without pressure [Pa]
     bulk_modulus: Float[Array, "*m"] = _number(default=0.0)  # of a fluid; 0: from young and poisson [Pa]
     viscosity: Float[Array, "*m"] = _number(default=0.0)  # dynamic [Pa s]; of a foam [Pa sʰ] with its exponent h
     flow_exponent: Float[Array, "*m"] = _number(default=1.0)  # h of Herschel and Bulkley; 1 is Bingham's, < 1 thins
