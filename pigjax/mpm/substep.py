@@ -514,6 +514,7 @@ def _rigid_step(
     stiff = context.rigid[:, None, None, None]
 
     def part(velocity, mass, own):
+        assert context.body_contact is not None
         return context.body_contact.part(velocity, mass, own[0])
 
     def hold_all(velocity, bounds, clear):
