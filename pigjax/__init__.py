@@ -58,6 +58,7 @@ from pigjax.splat import (
     required_capacity,
     surface_depth,
 )
+from pigjax.splatting.shadows import Light, cast_shadows, light_transmittance
 from pigjax.study import Experiment, experiment, load_study, sweep_study, tune_study
 from pigjax.study.optimize import Bounds, Table, fit, load_table, search, sweep
 
@@ -83,6 +84,7 @@ __all__ = [
     "Impulse",
     "InputError",
     "Labels",
+    "Light",
     "Material",
     "MaterialTable",
     "MissingFileError",
@@ -112,6 +114,7 @@ __all__ = [
     "at_frame",
     "bind",
     "boundary_iou",
+    "cast_shadows",
     "choose_integrator",
     "choose_substeps",
     "collider_from_gaussians",
@@ -134,6 +137,7 @@ __all__ = [
     "hole_mask",
     "interpolate_path",
     "lift_masks",
+    "light_transmittance",
     "load_dataset",
     "load_gaussians",
     "load_masks",

@@ -40,7 +40,8 @@ from pigjax.scene.schema import Scene, values_of
 from pigjax.scene.stages import Stage, simulate_stages, stages_of
 from pigjax.scene.world import described
 from pigjax.segmentation import Labels, pixel_ids
-from pigjax.splat import Gaussians, render
+from pigjax.splat import Gaussians, RenderConfig, Splats, render
+from pigjax.splatting.shadows import Light, cast_shadows, light_transmittance
 
 _SHEET_FRAMES = 12
 _FILES = (
@@ -351,6 +352,31 @@ def _checkpoint(path: Path, frame: int, particles: Particles, active: ActiveGrid
     io.save_pytree(path, (np.asarray(frame), particles, active.memory()), parts=parts)
 
 
+def shaded_picture(
+    gaussians: Gaussians,
+    splats: Splats,
+    camera: Camera,
+    shade: tuple[jax.Array, Light, jax.Array, jax.Array] | None,
+    config: RenderConfig,
+    background: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Picture of a frame in [0, 1], and the greatest stretch of each splat relative to rest.
+
+    Args:
+        gaussians: at rest.
+        splats: posed.
+        camera: of the frame.
+        shade: arguments of `cast_shadows` after the splats; None: no light, and nothing of it is traced.
+        config: of the renderer.
+        background: colour behind the splats.
+    """
+    if shade is not None:
+        splats = cast_shadows(splats, *shade)
+    frame = render(splats, camera, config, background=background, outputs=("rgb",))
+    longest = safe_norm(splats.factors, axis=1) / jnp.exp(gaussians.log_scales)  # of each axis
+    return jnp.clip(frame.rgb, 0, 1), longest.max(1)
+
+
 def _draw(
     scene: Scene,
     inputs: Inputs,
@@ -369,22 +395,34 @@ def _draw(
     background = jnp.asarray(scene.camera.background)
     config = render_config(scene)
 
+    light = None if scene.light is None else scene.light.to_light()
+    moving = np.isin(np.asarray(labels.object_id), [inputs.ids[n] for n, e in scene.objects.items() if not e.fixed])
+    casts, at_rest = jnp.asarray(moving), None
+
     # everything large comes in as an argument: XLA would fold constants for minutes
     @jax.jit
-    def pose_and_render(gaussians: Gaussians, particles: Particles, binding, camera: Camera):
+    def pose_and_render(gaussians: Gaussians, particles: Particles, binding, camera: Camera, shade):
         splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
-        frame = render(splats, camera, config, background=background, outputs=("rgb",))
-        longest = safe_norm(splats.factors, axis=1) / jnp.exp(gaussians.log_scales)  # of each axis, relative to rest
-        return jnp.clip(frame.rgb, 0, 1), longest.max(1)
+        return shaded_picture(gaussians, splats, camera, shade, config, background)
+
+    @jax.jit
+    def lit(gaussians: Gaussians, particles: Particles, binding, casts: jax.Array, light: Light):
+        splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
+        return light_transmittance(splats, casts, light)
 
     def draw(frame: int) -> tuple[jax.Array, jax.Array]:
         state = io.load_state(out / "states", frame, signature=key)
         particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, (state["x"], state["F_visual"]))
-        return pose_and_render(gaussians, particles, plan.binding, cameras[frame])
+        shade = None
+        if light is not None:
+            nonlocal at_rest
+            reached = lit(gaussians, particles, plan.binding, casts, light)
+            at_rest = reached if at_rest is None else at_rest  # the first frame that is drawn is the rest state
+            shade = casts, light, reached, at_rest
+        return pose_and_render(gaussians, particles, plan.binding, cameras[frame], shade)
 
     sheet_frames = np.unique(np.linspace(0, frames, _SHEET_FRAMES).round().astype(int))
     sheet: list[np.ndarray] = []
-    moving = np.isin(np.asarray(labels.object_id), [inputs.ids[n] for n, e in scene.objects.items() if not e.fixed])
     stretches: dict[str, list[float]] = {"median": [], "99 of 100 below": [], "most": []}
 
     every, within = scene.output.states_every, report.times["draw"]
