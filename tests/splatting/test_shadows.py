@@ -4,8 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import values
 
-from pigjax.core.errors import InputError
+from pigjax.core.errors import InputError, SceneError
+from pigjax.scene import scene_from
 from pigjax.splat import RenderConfig, Splats
 from pigjax.splatting.shadows import Light, cast_shadows, light_transmittance
 
@@ -156,3 +158,15 @@ def test_without_casting_splats_all_light_arrives():
         Light(direction=(0, 0, 0))
     with pytest.raises(InputError, match=r"Light\.strength = 2"):
         Light(direction=(0, 0, 1), strength=2.0)
+
+
+def test_a_scene_gives_its_light_in_degrees_and_refuses_one_that_goes_nowhere():
+    light = scene_from(values(light={"direction": [0, 0, -2], "softness": 9.0})).light
+    assert light is not None
+    np.testing.assert_allclose(light.to_light().softness, np.pi / 20)
+    assert light.to_light().samples == 8
+    hard = scene_from(values(light={"direction": [0, 0, -2], "softness": 0.0})).light
+    assert hard is not None
+    assert hard.to_light().samples == 1
+    with pytest.raises(SceneError, match=r"light\.direction = .*points nowhere"):
+        scene_from(values(light={"direction": [0, 0, 0]}))
