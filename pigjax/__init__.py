@@ -20,6 +20,7 @@ from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
 from pigjax.io import (
     Views,
+    example_folder,
     load_dataset,
     load_gaussians,
     load_masks,
@@ -34,6 +35,7 @@ from pigjax.io import (
 )
 from pigjax.mls_mpm import SimConfig, rollout, step
 from pigjax.mpm import Grid, Health, Particles, Trajectory, fit_grid, make_particles, vast_grid
+from pigjax.mpm.active_grid import choose_box
 from pigjax.mpm.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.forces import Force, ForceField, Impulse, Spring, Wind, grab
@@ -115,6 +117,7 @@ __all__ = [
     "bind",
     "boundary_iou",
     "cast_shadows",
+    "choose_box",
     "choose_integrator",
     "choose_substeps",
     "collider_from_gaussians",
@@ -124,6 +127,7 @@ __all__ = [
     "deform",
     "eigen_clamp",
     "evaluate_labels",
+    "example_folder",
     "experiment",
     "export_run",
     "extract_object",
@@ -186,3 +190,8 @@ __all__ = [
     "vast_grid",
     "write_video",
 ]
+
+
+def __dir__() -> list[str]:
+    """The public names alone, for completion and `dir`; subpackages are imported by their path."""
+    return sorted(__all__)

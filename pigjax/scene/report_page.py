@@ -76,7 +76,7 @@ def left_out(scene: Scene, report: RunReport) -> list[str]:
     """What the run does not model, with the setting that would where there is one."""
     spec, moving = scene.simulation, sum(not entry.fixed for entry in scene.objects.values())
     found = []
-    if moving > 1 and spec.contact_friction is None:
+    if moving > 1 and scene.contact_friction is None:
         found.append(
             "Contact between objects: they share one velocity field and stick where they touch"
             " (simulation.contact_friction parts them)."

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -154,6 +157,7 @@ def _run(
     prediction = _predict(scene, inputs, plan, stages, report, planned)
     say(report.plan)
     told = say if planned is not None else None
+    pictures = _Pictures.of(scene, inputs, plan)
     states = _simulate(scene, plan, stages, out / "states", parts, key, report, tell, told, prediction)
     followed = None
     if frames := min(scene.output.error_frames, scene.simulation.frames):
@@ -164,7 +168,7 @@ def _run(
             for _ in states:
                 pass
     with report.stage("draw"):
-        _draw(scene, inputs, plan, labels, out, key, report, tell, states)
+        _draw(scene, inputs, plan, labels, pictures, out, key, report, tell, states)
     if followed is not None:
         with report.stage("estimate"):
             tell("estimate", 0, 1)
@@ -377,11 +381,54 @@ def shaded_picture(
     return jnp.clip(frame.rgb, 0, 1), longest.max(1)
 
 
+def _moving(scene: Scene, inputs: Inputs, labels: Labels) -> np.ndarray:
+    """Which Gaussians belong to objects that move [n]."""
+    return np.isin(np.asarray(labels.object_id), [inputs.ids[n] for n, e in scene.objects.items() if not e.fixed])
+
+
+class _Pictures(NamedTuple):
+    """The cameras of all frames, and the program that poses and renders one, compiled beside the simulation."""
+
+    cameras: Camera
+    program: Future[Any]  # (gaussians, particles, binding, camera, shade): picture, largest stretch of each splat
+    lit: Callable[..., jax.Array] | None  # (gaussians, particles, binding, casts, light): transmittance
+    shade: tuple[jax.Array, Light, jax.Array, jax.Array] | None  # of `shaded_picture`, at rest
+
+    @classmethod
+    def of(cls, scene: Scene, inputs: Inputs, plan: Plan) -> _Pictures:
+        """Begin to compile."""
+        matter = np.asarray(plan.particles.x)
+        cameras = make_cameras(scene, inputs, matter.mean(0), matter)
+        background, config = jnp.asarray(scene.camera.background), render_config(scene)
+        lit, shade = None, None
+        if scene.light is not None:
+            ones = jnp.ones(len(inputs.gaussians), inputs.gaussians.means.dtype)
+            shade = jnp.asarray(_moving(scene, inputs, plan.labels)), scene.light.to_light(), ones, ones
+
+            @jax.jit
+            def lit(gaussians: Gaussians, particles: Particles, binding: Any, *lights: Any) -> jax.Array:
+                splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
+                return light_transmittance(splats, *lights)
+
+        # everything large comes in as an argument: XLA would fold constants for minutes
+        @jax.jit
+        def pose_and_render(gaussians: Gaussians, particles: Particles, binding: Any, camera: Camera, shade: Any):
+            splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
+            return shaded_picture(gaussians, splats, camera, shade, config, background)
+
+        traced = pose_and_render.lower(inputs.gaussians, plan.particles, plan.binding, cameras[0], shade)
+        compiler = ThreadPoolExecutor(1)
+        program = compiler.submit(traced.compile)
+        compiler.shutdown(wait=False)
+        return cls(cameras, program, lit, shade)
+
+
 def _draw(
     scene: Scene,
     inputs: Inputs,
     plan: Plan,
     labels: Labels,
+    drawn: _Pictures,
     out: Path,
     key: str,
     report: RunReport,
@@ -390,36 +437,27 @@ def _draw(
 ) -> None:
     """Pose and render each saved state, once `states` says that it is there; remove it where it is not to be kept."""
     frames, gaussians = scene.simulation.frames, inputs.gaussians
-    matter = np.asarray(plan.particles.x)
-    cameras = make_cameras(scene, inputs, matter.mean(0), matter)
-    background = jnp.asarray(scene.camera.background)
-    config = render_config(scene)
-
-    light = None if scene.light is None else scene.light.to_light()
-    moving = np.isin(np.asarray(labels.object_id), [inputs.ids[n] for n, e in scene.objects.items() if not e.fixed])
-    casts, at_rest = jnp.asarray(moving), None
-
-    # everything large comes in as an argument: XLA would fold constants for minutes
-    @jax.jit
-    def pose_and_render(gaussians: Gaussians, particles: Particles, binding, camera: Camera, shade):
-        splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
-        return shaded_picture(gaussians, splats, camera, shade, config, background)
-
-    @jax.jit
-    def lit(gaussians: Gaussians, particles: Particles, binding, casts: jax.Array, light: Light):
-        splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
-        return light_transmittance(splats, casts, light)
+    cameras, at_rest = drawn.cameras, None
+    moving = _moving(scene, inputs, labels)
 
     def draw(frame: int) -> tuple[jax.Array, jax.Array]:
+        nonlocal at_rest
         state = io.load_state(out / "states", frame, signature=key)
-        particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, (state["x"], state["F_visual"]))
-        shade = None
-        if light is not None:
-            nonlocal at_rest
-            reached = lit(gaussians, particles, plan.binding, casts, light)
+        there = tuple(np.asarray(state[name], plan.particles.x.dtype) for name in ("x", "F_visual"))
+        particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, there)
+        shade = drawn.shade
+        if shade is not None and drawn.lit is not None:
+            reached = drawn.lit(gaussians, particles, plan.binding, *shade[:2])
             at_rest = reached if at_rest is None else at_rest  # the first frame that is drawn is the rest state
-            shade = casts, light, reached, at_rest
-        return pose_and_render(gaussians, particles, plan.binding, cameras[frame], shade)
+            shade = *shade[:2], reached, at_rest
+        return program()(gaussians, particles, plan.binding, cameras[frame], shade)
+
+    def program() -> Any:
+        """The compiled program; time spent waiting for it counts as compiling."""
+        begun = time.perf_counter()
+        compiled = drawn.program.result()
+        report.times["draw"].compile += time.perf_counter() - begun
+        return compiled
 
     sheet_frames = np.unique(np.linspace(0, frames, _SHEET_FRAMES).round().astype(int))
     sheet: list[np.ndarray] = []
