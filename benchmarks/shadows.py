@@ -7,15 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.common.pages import TABLETOP, head, picture, row
+from benchmarks.common.pages import TABLETOP, head, row
 from benchmarks.common.timing import in_turn
-from pigjax import Light, RenderConfig, cast_shadows, light_transmittance, load_ply, orbit, render
-from pigjax.io import write_image
+from pigjax import Light, RenderConfig, light_transmittance, load_ply, orbit, render
 from pigjax.splatting.types import as_splats
 
-PICTURE = "shadows.png"
 _TOP = 0.326  # height of the table's top and a little [m]
-_LIFT = 0.08  # of the objects in the picture [m]
 
 
 def price(options) -> str:
@@ -44,16 +41,8 @@ def price(options) -> str:
     print(head("work", "ms", "pictures"))
     for name, run in found.items():
         print(row(name, f"{run.seconds * 1e3:.0f}", f"{run.seconds / base:.2f}"))
-    light = lights[options.samples[-1]]
-    rest = light_transmittance(splats, casts, light)
-    means = splats.means + _LIFT * casts[:, None] * jnp.array([0.0, 0.0, 1.0])
-    moved = type(splats)(means, splats.factors, splats.opacities, splats.sh)
-    lit = cast_shadows(moved, casts, light, light_transmittance(moved, casts, light), rest)
-    shown = [np.clip(np.asarray(draw(splats)), 0, 1) for splats in (splats, moved, lit)]
-    write_image(options.media / PICTURE, np.concatenate(shown, 1))
     return (
         f"\n{len(splats)} splats, of which {int(casts.sum())} cast; pictures of {camera.width}x{camera.height} pixels."
-        f"\n\n{picture(PICTURE, 'at rest; lifted, without and with shadows')}"
     )
 
 
