@@ -79,6 +79,7 @@ def test_many_splats_multiply_as_in_a_dense_product():
     np.testing.assert_allclose(light_transmittance(single, casts, SLANTED), reached, atol=5e-3)
 
 
+@pytest.mark.slow  # the paths of many samples; the dense product checks the same sums
 def test_the_umbra_of_a_disc_lies_where_the_light_throws_it():
     step = 0.05
     x, y = np.meshgrid(np.arange(-0.5, 0.5001, step), np.arange(-0.5, 0.5001, step))
