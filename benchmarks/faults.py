@@ -308,7 +308,7 @@ class Study:
 KINDS = {"kills": "killed", "disks": "full disk", "damages": "damaged"}
 
 
-def faults(commands, kinds, count, seed=0):
+def faults(commands, kinds, count, seed=0, tell=lambda name, counts: None):
     """Trials of each command; its counts by name, and the faults.
 
     Args:
@@ -316,6 +316,7 @@ def faults(commands, kinds, count, seed=0):
         kinds: names of methods of `Study`: kills, disks, damages.
         count: of each kind; of disks and damages half as many.
         seed: of moments and damages.
+        tell: gets the counts of each command that is done.
     """
     counts, bad = {}, []
     with tempfile.TemporaryDirectory() as folder:
@@ -328,16 +329,19 @@ def faults(commands, kinds, count, seed=0):
                 for kind in kinds:
                     getattr(study, kind)(count if kind == "kills" else -(-count // 2))
                 counts[name], bad = study.counts, bad + study.faults
+                tell(name, study.counts)
     return counts, bad
 
 
 def table(options, kinds):
     """Print the counts of each command; end with 1 where one did not come out the same."""
     begun = time.monotonic()
-    counts, bad = faults(options.commands, kinds, options.count, options.seed)
-    print(head("command", *KINDS.values(), "refused, then replaced", "ended the same", "ended otherwise"))
-    for name, found in counts.items():
+
+    def tell(name, found):
         print(row(name, *(found[kind] for kind in KINDS.values()), found["refused"], found["same"], found["other"]))
+
+    print(head("command", *KINDS.values(), "refused, then replaced", "ended the same", "ended otherwise"))
+    _, bad = faults(options.commands, kinds, options.count, options.seed, tell)
     print(f"\n{time.monotonic() - begun:.0f} s.")
     if bad:
         sys.exit(1)
