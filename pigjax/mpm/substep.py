@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.mpm import WALL, Grid, State, StepHealth
-from pigjax.mpm.boundaries import Bounds, clear_of, hold, places_of
+from pigjax.mpm.boundaries import Bounds, hold, hold_at_edges, places_of, smooth, touch
 from pigjax.mpm.by_law import by_component, by_row
 from pigjax.mpm.chunked import ChunkLoop, gather_chunks, scatter_chunks
 from pigjax.mpm.colliders import Collider, Contact, Press, Time
@@ -29,7 +29,7 @@ from pigjax.mpm.forces import Force, Matter
 from pigjax.mpm.health import LaneHealth
 from pigjax.mpm.materials import Parameters, respond
 from pigjax.mpm.materials.tensors import determinant, product
-from pigjax.mpm.rigid import Meeting, rigid_velocities
+from pigjax.mpm.rigid import Holder, Meeting, Nodes, rigid_velocities
 from pigjax.mpm.transfers import (
     CHANNELS,
     Kernel,
@@ -510,27 +510,62 @@ def _rigid_step(
     meets, moments = bounds.holds(context.domain)[..., None], _moments(statics, context, states)
     between = None if context.body_contact is None else _faces(context, nodes, moments)
     meets = meets if between is None else meets | between.near
-    middle = moments / jnp.where(filled, nodes.reshape(*apart, 4)[..., :1], 1.0)
+    around = smooth(nodes.reshape(*apart, 4)[..., :1])
+    middle = smooth(moments) / jnp.where(around > 0, around, 1.0)
     stiff = context.rigid[:, None, None, None]
 
     def part(velocity, mass, own):
         assert context.body_contact is not None
         return context.body_contact.part(velocity, mass, own[0])
 
-    def hold_all(velocity, bounds, clear):
-        return hold(velocity, context.colliders, bounds, statics.walls, context.domain, clear=clear)
+    def hold_all(velocity, bounds):
+        return hold(velocity, context.colliders, bounds, statics.walls, context.domain)
 
-    def clear(own, bounds):
-        at = (jnp.stack(bounds.places, -1) - context.low).astype(velocity.dtype)
-        found = partial(clear_of, grid=context.grid, nodes=at, middle=own[1], time=time)
-        return tuple(stiff & found(collider) for collider in context.colliders)
+    def holders(nodes):
+        at = (jnp.stack(nodes.bounds.places, -1) - context.low).astype(velocity.dtype)
+        found = [
+            _holder(statics, context, collider, contact, nodes, at, stiff, time)
+            for collider, contact in zip(context.colliders, nodes.bounds.contacts)
+        ]
+        edges = partial(hold_at_edges, bounds=nodes.bounds, walls=statics.walls, domain=context.domain)
+        return (*found, Holder(edges, nodes.arms))
 
-    contact = Meeting(None if between is None else part, hold_all, clear)
+    contact = Meeting(None if between is None else part, hold_all, holders)
     cells = context.dt / context.grid.dx
     return rigid_velocities(
         context.rigid, mass, velocity, filled & meets, contact, (between, middle), bounds, cells,
         statics.contact_rounds,
     ).reshape(*context.nodes, 3)  # fmt: skip
+
+
+def _holder(
+    statics: StepStatics,
+    context: StepContext,
+    collider: Collider,
+    contact: Contact,
+    nodes: Nodes,
+    at: Float[Array, "x y z 3"],
+    stiff: Bool[Array, "b 1 1 1"],
+    time: Time,
+) -> Holder:
+    """A collider that holds rigid bodies where they touch it.
+
+    One that they may leave lets them approach by as much as closes the gap in the step (Stewart and Trinkle 1996);
+    others hold what has none.
+    """
+    point, gap = touch(
+        collider, contact, grid=context.grid, kernel=statics.kernel, nodes=at, middle=nodes.faces[1],
+        filled=nodes.weight[..., 0] > 0, time=time,
+    )  # fmt: skip
+    open_, leaves = (stiff & (gap > 0))[..., None], collider.mode == "separate"
+    closing = jnp.where(stiff, gap * context.grid.dx / context.dt, 0.0)[..., None] * contact.normal
+
+    def act(velocity):
+        if leaves:
+            return collider.apply(contact, velocity + closing) - closing
+        return jnp.where(open_, velocity, collider.apply(contact, velocity))
+
+    return Holder(act, nodes.arms + point - at)
 
 
 def apply_boundaries(
