@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -13,7 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.mpm import WALL, Grid
 from pigjax.mpm.colliders import Collider, Contact, Press, Time
-from pigjax.mpm.transfers import Kernel, first_nodes
+from pigjax.mpm.rigid import Holder
+from pigjax.mpm.transfers import Kernel, first_nodes, half_space
 
 # Gap at which a body touches a collider [cells]. It is measured by the matter of some cells around, so that a flat face
 # stands as far off the collider, and a ball of three cells' radius sinks in as far.
@@ -96,60 +96,72 @@ def smooth(values: Float[Array, "b x y z k"]) -> Float[Array, "b x y z k"]:
     return values
 
 
-@lru_cache
-def _of_half_spaces(kernel: Kernel) -> np.ndarray:
-    """Of matter beyond a face, by a node's depth before it [cells]: depths, middles over the face, and their slopes.
+class Around(NamedTuple):
+    """Matter of bodies around nodes."""
 
-    The middle is the mean of the smoothed B-spline over what is beyond the face.
-    """
-    at = (np.arange(1000) + 0.5) / 1000 - (0.5 if kernel.nearest else 0.0)
-    parts = [np.asarray(weight) for weight in kernel.weights(at)]
-    spline = np.concatenate([part[::-1] for part in parts])  # by the way from a particle to a node, at growing ones
-    way = np.concatenate([offset - at[::-1] for offset in kernel.offsets])
-    places = np.round((way[0] - 1) * 1000 + np.arange(len(way) + 2000)) / 1000
-    whole = sum(share * np.pad(spline, (k, 2000 - k)) for k, share in ((0, 0.25), (1000, 0.5), (2000, 0.25)))
-    beyond, moment = (np.cumsum(part[::-1])[::-1] for part in (whole, whole * places))
-    some = slice(500, -50)  # where that is well defined; real depths are less by a cell
-    depth, middle = places[some], moment[some] / beyond[some] - places[some]
-    return np.stack([depth, middle, np.gradient(middle, depth)])[:, ::50]
+    nodes: Float[Array, "x y z 3"]  # places in the window [cells]
+    middle: Float[Array, "b x y z 3"]  # by `smooth` masses, in the window [cells]
+    filled: Bool[Array, "b x y z"]  # nodes that matter reaches
+    rigid: Bool[Array, "b 1 1 1"]
 
 
-def touch(
+def holder(
     collider: Collider,
     contact: Contact,
-    *,
+    matter: Around,
+    arms: Float[Array, "b x y z 3"],
     grid: Grid,
     kernel: Kernel,
-    nodes: Float[Array, "x y z 3"],
-    middle: Float[Array, "b x y z 3"],
-    filled: Bool[Array, "b x y z"],
+    dt: Float[Array, ""],
     time: Time,
+) -> Holder:
+    """A collider that holds rigid bodies where they touch it.
+
+    One that they may leave lets them approach by as much as closes the gap in the step (Stewart 2000, doi
+    10.1137/S0036144599360110); others hold what has none.
+
+    Args:
+        collider: that the nodes may be in.
+        contact: of the nodes.
+        matter: around them.
+        arms: of the nodes from the centres of mass of the bodies [cells].
+        grid: window of nodes.
+        kernel: of the transfers.
+        dt: of the step [s].
+        time: since the collider was where its numbers say [s].
+    """
+    point, gap = _touch(collider, contact, matter, grid, kernel, time)
+    gap = jnp.where(matter.rigid, gap, 0.0)[..., None]
+    closing = gap * grid.dx / dt * contact.normal
+
+    def act(velocity):
+        if collider.mode == "separate":
+            return collider.apply(contact, velocity + closing) - closing
+        return jnp.where(gap > 0, velocity, collider.apply(contact, velocity))
+
+    return Holder(act, arms + point - matter.nodes)
+
+
+def _touch(
+    collider: Collider, contact: Contact, matter: Around, grid: Grid, kernel: Kernel, time: Time
 ) -> tuple[Float[Array, "b x y z 3"], Float[Array, "b x y z"]]:
-    """Where rigid bodies may touch a collider by the matter around nodes [cells], and how far off they are [cells].
+    """Where bodies may touch a collider by the matter around nodes [cells], and how far off they are [cells].
 
     The point of a node is the middle of the matter around it, moved to the surface of the collider. So the points lie
     under the matter, and those of a curved body gather under its lowest part, wherever the nodes are. A gap is found by
     the height of the middle: matter behind a flat face on the collider has a known one. Gaps count from the least one
     of a body, if that touches.
-
-    Args:
-        collider: that the nodes may be in.
-        contact: of the nodes.
-        grid: window of nodes.
-        kernel: of the transfers.
-        nodes: their places in the window [cells].
-        middle: of each body's matter around the nodes, by `smooth` masses, in the window [cells].
-        filled: nodes that matter reaches.
-        time: since the collider was where its numbers say [s].
     """
-    depth = -collider.distance(grid.origin + grid.dx * nodes, time) / grid.dx
-    height = collider.distance(grid.origin + grid.dx * middle, time) / grid.dx
-    known = jnp.asarray(_of_half_spaces(kernel), depth.dtype)
-    gap = (height - jnp.interp(depth, known[0], known[1])) / (1 + jnp.interp(depth, known[0], known[2]))
-    near = filled & (contact.inside > 0)
+    depth = -collider.distance(grid.origin + grid.dx * matter.nodes, time) / grid.dx
+    height = collider.distance(grid.origin + grid.dx * matter.middle, time) / grid.dx
+    known = half_space(kernel, smoothed=True)
+    depths = jnp.asarray(known.depth, depth.dtype)
+    middles, slopes = (jnp.interp(depth, depths, jnp.asarray(of, depth.dtype)) for of in (known.middle, known.slope))
+    gap = (height - middles) / (1 + slopes)
+    near = matter.filled & (contact.inside > 0)
     least = jnp.where(near, gap, jnp.inf).min((1, 2, 3), keepdims=True)
     gap = jnp.maximum(gap - jnp.minimum(least, _TOUCHES) - _EVEN, 0.0)
-    return middle - height[..., None] * contact.normal, jnp.where(near, gap, 0.0)
+    return matter.middle - height[..., None] * contact.normal, jnp.where(near, gap, 0.0)
 
 
 def apply_walls(

@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.mpm import WALL, Grid, State, StepHealth
-from pigjax.mpm.boundaries import Bounds, hold, hold_at_edges, places_of, smooth, touch
+from pigjax.mpm.boundaries import Around, Bounds, hold, hold_at_edges, holder, places_of, smooth
 from pigjax.mpm.by_law import by_component, by_row
 from pigjax.mpm.chunked import ChunkLoop, gather_chunks, scatter_chunks
 from pigjax.mpm.colliders import Collider, Contact, Press, Time
@@ -29,7 +29,7 @@ from pigjax.mpm.forces import Force, Matter
 from pigjax.mpm.health import LaneHealth
 from pigjax.mpm.materials import Parameters, respond
 from pigjax.mpm.materials.tensors import determinant, product
-from pigjax.mpm.rigid import Holder, Meeting, Nodes, rigid_velocities
+from pigjax.mpm.rigid import Holder, Meeting, rigid_velocities
 from pigjax.mpm.transfers import (
     CHANNELS,
     Kernel,
@@ -468,7 +468,9 @@ def _separate_bodies(
     """Velocities after contact between bodies."""
     assert context.body_contact is not None
     mass = nodes.reshape(context.bodies, *context.grid.shape, 4)[..., :1] / context.unit_mass
-    return context.body_contact.part(velocity, mass, _faces(context, nodes, _moments(statics, context, states)))
+    return context.body_contact.part(
+        velocity, mass, _faces(statics, context, nodes, _moments(statics, context, states))
+    )
 
 
 def _moments(statics: StepStatics, context: StepContext, states: tuple[State, ...]) -> Float[Array, "b x y z 3"]:
@@ -484,11 +486,14 @@ def _moments(statics: StepStatics, context: StepContext, states: tuple[State, ..
     return moment.reshape(context.bodies, *context.grid.shape, 4)[..., 1:]
 
 
-def _faces(context: StepContext, nodes: Float[Array, "n y z 4"], moments: Float[Array, "b x y z 3"]) -> Faces:
+def _faces(
+    statics: StepStatics, context: StepContext, nodes: Float[Array, "n y z 4"], moments: Float[Array, "b x y z 3"]
+) -> Faces:
     """Where bodies touch."""
     assert context.specific_volume is not None
     specific = context.specific_volume[:, None, None, None, None]
-    return faces(specific * nodes.reshape(*moments.shape[:-1], 4)[..., :1], specific * moments)
+    edges = None if context.rigid is None else statics.kernel
+    return faces(specific * nodes.reshape(*moments.shape[:-1], 4)[..., :1], specific * moments, edges)
 
 
 def _rigid_step(
@@ -508,7 +513,7 @@ def _rigid_step(
     places = places_of(context.grid.shape, context.low)
     bounds = Bounds(tuple(_contacts(context, time)), context.frozen, places).at_all(context.grid.shape)
     meets, moments = bounds.holds(context.domain)[..., None], _moments(statics, context, states)
-    between = None if context.body_contact is None else _faces(context, nodes, moments)
+    between = None if context.body_contact is None else _faces(statics, context, nodes, moments)
     meets = meets if between is None else meets | between.near
     around = smooth(nodes.reshape(*apart, 4)[..., :1])
     middle = smooth(moments) / jnp.where(around > 0, around, 1.0)
@@ -523,8 +528,9 @@ def _rigid_step(
 
     def holders(nodes):
         at = (jnp.stack(nodes.bounds.places, -1) - context.low).astype(velocity.dtype)
+        matter = Around(at, nodes.faces[1], nodes.weight[..., 0] > 0, stiff)
         found = [
-            _holder(statics, context, collider, contact, nodes, at, stiff, time)
+            holder(collider, contact, matter, nodes.arms, context.grid, statics.kernel, context.dt, time)
             for collider, contact in zip(context.colliders, nodes.bounds.contacts)
         ]
         edges = partial(hold_at_edges, bounds=nodes.bounds, walls=statics.walls, domain=context.domain)
@@ -536,36 +542,6 @@ def _rigid_step(
         context.rigid, mass, velocity, filled & meets, contact, (between, middle), bounds, cells,
         statics.contact_rounds,
     ).reshape(*context.nodes, 3)  # fmt: skip
-
-
-def _holder(
-    statics: StepStatics,
-    context: StepContext,
-    collider: Collider,
-    contact: Contact,
-    nodes: Nodes,
-    at: Float[Array, "x y z 3"],
-    stiff: Bool[Array, "b 1 1 1"],
-    time: Time,
-) -> Holder:
-    """A collider that holds rigid bodies where they touch it.
-
-    One that they may leave lets them approach by as much as closes the gap in the step (Stewart and Trinkle 1996);
-    others hold what has none.
-    """
-    point, gap = touch(
-        collider, contact, grid=context.grid, kernel=statics.kernel, nodes=at, middle=nodes.faces[1],
-        filled=nodes.weight[..., 0] > 0, time=time,
-    )  # fmt: skip
-    open_, leaves = (stiff & (gap > 0))[..., None], collider.mode == "separate"
-    closing = jnp.where(stiff, gap * context.grid.dx / context.dt, 0.0)[..., None] * contact.normal
-
-    def act(velocity):
-        if leaves:
-            return collider.apply(contact, velocity + closing) - closing
-        return jnp.where(open_, velocity, collider.apply(contact, velocity))
-
-    return Holder(act, nodes.arms + point - at)
 
 
 def apply_boundaries(
