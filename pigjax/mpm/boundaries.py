@@ -136,7 +136,9 @@ def holder(
 
     def act(velocity):
         if collider.mode == "separate":
-            return collider.apply(contact, velocity + closing) - closing
+            slower = velocity + closing
+            held = collider.apply(contact, slower)
+            return jnp.where(held == slower, velocity, held - closing)  # what it leaves alone is not rounded
         return jnp.where(gap > 0, velocity, collider.apply(contact, velocity))
 
     return Holder(act, arms + point - matter.nodes)

@@ -79,7 +79,7 @@ def half_space(kernel: Kernel, smoothed: bool = False) -> HalfSpace:
     """Numbers of a half space; `smoothed` nodes are binomial means of three."""
     fine = 1000
     at = (np.arange(fine) + 0.5) / fine - (0.5 if kernel.nearest else 0.0)
-    spline = np.concatenate([np.asarray(weight)[::-1] for weight in kernel.weights(at)])  # by place from the node
+    spline = np.concatenate([np.asarray(weight)[::-1] for weight in kernel.weights(at)]  # type: ignore[arg-type])  # by place from the node
     start = kernel.offsets[0] - at[-1]
     places = start - 1 + np.arange(len(spline) + 2 * fine) / fine
     shares = (0.25, 0.5, 0.25) if smoothed else (0.0, 1.0, 0.0)
