@@ -79,11 +79,13 @@ def half_space(kernel: Kernel, smoothed: bool = False) -> HalfSpace:
     """Numbers of a half space; `smoothed` nodes are binomial means of three."""
     fine = 1000
     at = (np.arange(fine) + 0.5) / fine - (0.5 if kernel.nearest else 0.0)
-    spline = np.concatenate([np.asarray(weight)[::-1] for weight in kernel.weights(at)]  # type: ignore[arg-type])  # by place from the node
+    weights: list[Any] = kernel.weights(at)  # type: ignore[arg-type]  # NumPy's in, NumPy's out
+    spline = np.concatenate([weight[::-1] for weight in weights])  # by place from the node
     start = kernel.offsets[0] - at[-1]
     places = start - 1 + np.arange(len(spline) + 2 * fine) / fine
     shares = (0.25, 0.5, 0.25) if smoothed else (0.0, 1.0, 0.0)
-    whole = sum(share * np.pad(spline, (k * fine, (2 - k) * fine)) for k, share in enumerate(shares)) / fine
+    padded = [share * np.pad(spline, (k * fine, (2 - k) * fine)) for k, share in enumerate(shares)]
+    whole = np.sum(padded, 0) / fine
     reach = np.flatnonzero(whole)[[0, -1]]
     places, whole = places[reach[0] : reach[1] + 1], whole[reach[0] : reach[1] + 1]
     beyond, moment = (np.cumsum(part[::-1])[::-1] for part in (whole, whole * places))
