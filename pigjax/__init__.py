@@ -15,6 +15,7 @@ from pigjax.core.regions import BoxRegion, HalfSpace, SphereRegion
 from pigjax.core.upright import Upright, find_up
 from pigjax.coupling.binding import at_frame, bind, deform
 from pigjax.coupling.outliers import cut_outliers
+from pigjax.coupling.own_splats import OwnSplats, make_own_splats
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
 from pigjax.io import (
@@ -85,6 +86,7 @@ __all__ = [
     "Material",
     "MaterialTable",
     "MissingFileError",
+    "OwnSplats",
     "Particles",
     "Plane",
     "RenderConfig",
@@ -142,6 +144,7 @@ __all__ = [
     "load_table",
     "load_views",
     "look_at",
+    "make_own_splats",
     "make_particles",
     "material_table",
     "mean_iou",

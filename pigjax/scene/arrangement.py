@@ -65,7 +65,7 @@ def arrange(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs
             parts.append(replace(here, means=here.means + jnp.asarray(shift, here.means.dtype)))
             owners.append(free)
     everything = jax.tree.map(lambda *columns: jnp.concatenate(columns), base, *parts)
-    labels = _extended(labels, [len(part) for part in parts], owners)
+    labels = appended(labels, [len(part) for part in parts], owners)
     return with_fields(scene, objects=objects), replace(inputs, gaussians=everything, ids=ids, arranged=True), labels
 
 
@@ -107,7 +107,7 @@ def _with_bands(gaussians: Gaussians, count: int) -> Gaussians:
     return gaussians if more == 0 else replace(gaussians, sh=jnp.pad(gaussians.sh, ((0, 0), (0, more), (0, 0))))
 
 
-def _extended(labels: Labels, counts: list[int], owners: list[int]) -> Labels:
+def appended(labels: Labels, counts: list[int], owners: list[int]) -> Labels:
     """Labels with more Gaussians at the end, of known objects."""
     more = sum(counts)
     labels = replace(

@@ -36,7 +36,7 @@ from pigjax.objects.lifting import lift
 from pigjax.scene.advice import default_dx, remarks_on
 from pigjax.scene.forces import forces_of
 from pigjax.scene.framing import framing_camera
-from pigjax.scene.schema import INPUT_FILES, CameraSpec, ClampSpec, Scene, SimulationSpec
+from pigjax.scene.schema import INPUT_FILES, OF_DRAWING, CameraSpec, ClampSpec, Scene, SimulationSpec
 from pigjax.scene.world import WorldSpec, axis_of, file_to_world, height_of, metres_of, placed_cameras
 from pigjax.segmentation import Labels, fill_unseen
 from pigjax.splat import Gaussians, RenderConfig
@@ -473,6 +473,9 @@ def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
         settings["output"] = {"compress_states": True}
     for name in INPUT_FILES:
         settings["input"].pop(name)
+    for entry in settings["objects"].values():
+        for name in OF_DRAWING:
+            entry.pop(name)
     views = inputs.views
     content = {
         "Gaussians": inputs.gaussians,

@@ -27,6 +27,8 @@ from pigjax.scene.world import WorldSpec, axis_of, metres_of
 from pigjax.splatting.types import RenderConfig
 
 Triple = tuple[float, float, float]
+_OF_OWN_SPLATS = {"inside": None, "surface": "particles", "transparency": 0.0}
+OF_DRAWING = ("splats", *_OF_OWN_SPLATS)  # fields of an object on which no simulated state depends
 _NUMBERS = tuple(number.name for number in fields(Parameters))
 _PLACE = Limits(-1e9, 1e9, unit="m")
 _LENGTH = Limits(0, 1e9, above=True, unit="m")
@@ -178,6 +180,13 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     model: str | None = None
     velocity: Annotated[Triple, _SPEED] = (0.0, 0.0, 0.0)
     angular_velocity: Annotated[Triple, Limits(-1e6, 1e6, unit="rad/s")] = (0.0, 0.0, 0.0)  # about its centre of mass
+    # its splats in motion: those of the capture ("carried"), or ones as fine as its particles, made once ("own");
+    # "auto": own ones for sand, snow, fluids, foam and plasticine, and for other matter that the simulation tore
+    splats: Literal["carried", "own", "auto"] = "carried"
+    inside: Annotated[Triple, Limits(0, 1)] | None = None  # colour within, of own splats; None: of the nearest surface
+    # of a fluid with own splats: "smooth" shapes them by their neighbours, so that a pool is flat and a drop round
+    surface: Literal["particles", "smooth"] = "particles"
+    transparency: Annotated[float, Limits(0, 1)] = 0.0  # of own splats: 0 as in the capture, 1 not there
     start: Annotated[float, Limits(0, 1e6, unit="s")] = 0.0  # simulated time until which it stands still, as a rock
     density: Annotated[float, Limits(unit="kg/m³")] | None = None
     young: Annotated[float, Limits(unit="Pa")] | None = None
@@ -210,6 +219,10 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
             for name in ("velocity", "angular_velocity"):
                 yield name, not any(getattr(self, name)), "a fixed object does not move; remove one of the two"
             yield "start", self.start == 0, "a fixed object does not move; remove one of the two"
+            yield "splats", self.splats == "carried", "a fixed object does not move; remove one of the two"
+        for name, still in _OF_OWN_SPLATS.items():
+            rule = f'it belongs to splats of its own; give splats = "own" or "auto", or remove {name}'
+            yield name, self.splats != "carried" or getattr(self, name) == still, rule
         both = self.gaussians is not None and (self.within is not None or self.id is not None)
         yield "gaussians", not both, "a file of its own needs no id and no region; remove one of the two"
 
