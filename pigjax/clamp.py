@@ -121,7 +121,7 @@ def held_deformation(
     """Deformation gradients with their change of size and their change of shape each held within the bounds.
 
     F = U S Vᵀ has the mean stretch j = |det F|^(1/3). Both j and the stretches S / j, whose product stays 1, are held
-    between tau_min and tau_max, so that a splat keeps the volume of its particle where that is within bounds.
+    between tau_min and tau_max, and so is each stretch: a splat keeps the volume of its particle where that can be.
     Bounds in metres (`relative` false) do not apply to a deformation: 0.5 and 2 stand for them.
 
     Args:
@@ -137,7 +137,7 @@ def held_deformation(
     stretch = jnp.maximum(jnp.abs(stretch), _SMALLEST_FRACTION)
     size = jnp.cbrt(stretch.prod(-1, keepdims=True))
     shape = jnp.clip(stretch / size, low, high)
-    held = jnp.clip(size, low, high) * shape / jnp.cbrt(shape.prod(-1, keepdims=True))
+    held = jnp.clip(jnp.clip(size, low, high) * shape / jnp.cbrt(shape.prod(-1, keepdims=True)), low, high)
     turned = jnp.swapaxes(v, -1, -2)
     return matmul3(u * held[:, None, :], turned), matmul3(u, turned), held.max(-1)
 
