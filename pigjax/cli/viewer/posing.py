@@ -34,6 +34,7 @@ class Poser:
         own = np.asarray(particles.gaussian)
         self._with_gaussian = np.flatnonzero(own >= 0)
         carried = [own[self._with_gaussian]] + ([] if binding is None else [np.asarray(binding.gaussian)])
+        carried += [] if binding is None or binding.own is None else [np.asarray(binding.own.gaussian)]
         self.rows: Int[np.ndarray, "m"] = np.concatenate(carried)  # indices of the moving Gaussians
 
     def pose(
@@ -57,7 +58,8 @@ class Poser:
         if self.binding is None:
             return own
         shared = np.sum(np.asarray(self.binding.weights) * values[np.asarray(self.binding.particles)], 1)
-        return np.concatenate([own, shared])
+        made = self.binding.own
+        return np.concatenate([own, shared] + ([] if made is None else [values[np.asarray(made.rows[made.at])]]))
 
 
 @partial(jax.jit, static_argnames="mode")
