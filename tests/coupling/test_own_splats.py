@@ -63,7 +63,7 @@ def lengths(splats):
 
 def test_pieces_look_like_what_they_are_cut_from():
     gaussians, _ = ball()
-    camera = look_at((1.3, 0.3, 0.2), (0, 0, 0), focal=120.0, width=64, height=64)
+    camera = look_at((1.3, 0.3, 0.2), (0.0, 0.0, 0.0), focal=120.0, width=64, height=64)
     whole = render(gaussians, camera, background=1.0).rgb
     pieces = split(gaussians, WIDEST * DX)
     assert len(pieces) > 8 * len(gaussians)
@@ -79,9 +79,9 @@ def test_small_gaussians_are_not_cut():
 
 def test_fit_brings_the_picture_at_rest_back():
     gaussians, x = ball()
-    camera = look_at((1.3, 0.3, 0.2), (0, 0, 0), focal=60.0, width=32, height=32)
+    camera = look_at((1.3, 0.3, 0.2), (0.0, 0.0, 0.0), focal=60.0, width=32, height=32)
     near = [
-        look_at((1.3 * np.cos(a), 1.3 * np.sin(a), 0.2), (0, 0, 0), focal=60.0, width=32, height=32) for a in range(6)
+        look_at((1.3 * np.cos(a), 1.3 * np.sin(a), 0.2), (0.0, 0.0, 0.0), focal=60.0, width=32, height=32) for a in range(6)
     ]
     cameras = jax.tree.map(lambda *v: jnp.stack(v), camera, *near)
     made = make_own_splats(gaussians, x, dx=DX, cameras=cameras, steps=30)

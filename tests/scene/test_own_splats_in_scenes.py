@@ -18,7 +18,7 @@ from pigjax.scene.own import chosen, is_torn
 
 def quick(gaussians, x, **settings):
     """A short fit to small pictures."""
-    cameras = orbit((0, 0, 0.3), radius=1.5, elevation=0.3, frames=3, focal=40.0, width=24, height=24)
+    cameras = orbit((0.0, 0.0, 0.3), radius=1.5, elevation=0.3, frames=3, focal=40.0, width=24, height=24)
     return make_own_splats(gaussians, x, **{**settings, "steps": 2, "cameras": cameras})
 
 
