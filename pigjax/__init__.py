@@ -46,7 +46,7 @@ from pigjax.objects.evaluation import evaluate_labels
 from pigjax.objects.selection import grow_selection, select_colour, select_part, select_stroke
 from pigjax.reconstruction.prune import contributions, prune
 from pigjax.reconstruction.reconstruct import FitConfig, reconstruct
-from pigjax.scene import Run, RunReport, Scene, export_run, load_run, load_scene, run_scene
+from pigjax.scene import Run, RunReport, Scene, ScenePlan, export_run, load_run, load_scene, plan_scene, run_scene
 from pigjax.scene.world import placed_cameras
 from pigjax.segmentation import Labels, fill_unseen, lift_masks, object_mask
 from pigjax.splat import (
@@ -95,6 +95,7 @@ __all__ = [
     "SampledDistance",
     "Scene",
     "SceneError",
+    "ScenePlan",
     "SimConfig",
     "SimulationError",
     "Sleep",
@@ -153,6 +154,7 @@ __all__ = [
     "origin_of",
     "placed",
     "placed_cameras",
+    "plan_scene",
     "preset",
     "prune",
     "psnr",

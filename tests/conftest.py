@@ -1,4 +1,4 @@
-"""Every test runs with jaxtyping + beartype on the whole package, and with strict JAX modes."""
+"""Strict JAX modes; with `PIGJAX_CHECK_SHAPES=1` jaxtyping + beartype check the whole package."""
 
 import gc
 import os
@@ -12,7 +12,8 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
-hook = install_import_hook("pigjax", "beartype.beartype")
+if os.environ.get("PIGJAX_CHECK_SHAPES", "0") != "0":  # a fifth of the time of a run
+    hook = install_import_hook("pigjax", "beartype.beartype")
 os.environ.setdefault("PIGJAX_SHORT", "1")  # notebooks run in their short form
 
 # Compiles in half the processor time, to code that runs slower: tests and short notebooks, but for the slow ones,
@@ -48,6 +49,18 @@ def pytest_configure(config):
         os.environ.pop("XLA_FLAGS", None)
     else:
         os.environ["XLA_FLAGS"] = given
+
+
+SLOW = Path(__file__).with_name("slow.txt")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Mark the tests that the list names: cases of a test, and notebooks, for which a decorator has no place."""
+    listed = {line for line in SLOW.read_text().splitlines() if not line.startswith("#")}
+    for item in items:
+        if item.nodeid in listed:
+            item.add_marker(pytest.mark.slow)
 
 
 def pytest_collection_finish():

@@ -12,11 +12,14 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-from pigjax.cli import exporting, objects, printing, scenes, starting, studies  # their commands join the app
+from pigjax.cli import exporting, objects, planning, printing, scenes, starting, studies  # their commands join the app
 from pigjax.cli.base import Stopped, app, console, one_device_per_core, said
 from pigjax.core.errors import InputError, SimulationError
 
-__all__ = ["app", "exporting", "main", "objects", "one_device_per_core", "printing", "scenes", "starting", "studies"]
+__all__ = [
+    "app", "exporting", "main", "objects", "one_device_per_core", "planning", "printing", "scenes", "starting",
+    "studies",
+]  # fmt: skip
 
 _STOPPED = "stopped; run the same command again to go on from the last saved state."
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)

@@ -99,7 +99,7 @@ def _without_cache(no_cache: bool) -> bool:
 
 NoCache = Annotated[
     bool,
-    typer.Option("--no-cache", help="Compile everything anew and keep nothing of it.", callback=_without_cache),
+    typer.Option("--no-cache", help="Recompile all programs, and store none.", callback=_without_cache),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors alone.", callback=_hush)]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from importlib import resources
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from msgspec import structs
@@ -30,11 +30,9 @@ from pigjax.cli.base import (
     row,
     said,
 )
+from pigjax.cli.planning import Accuracy, Error, Memory, Time
 from pigjax.core.errors import InputError
 
-AccuracyOption = Annotated[
-    str | None, typer.Option("--accuracy", help="draft, standard or reference, instead of the scene file's.")
-]
 File = Annotated[
     Path | None,
     typer.Option(
@@ -56,7 +54,7 @@ def example_folder() -> Path:
 @app.command()
 def demo(
     out: Out = Path("pigjax-demo"),
-    accuracy: AccuracyOption = None,
+    accuracy: Accuracy = None,
     changes: Changes = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -70,15 +68,23 @@ def demo(
 def run(
     scene: Annotated[Path, typer.Argument(help="Scene file (.toml).")],
     out: Out = Path("out"),
-    accuracy: AccuracyOption = None,
+    accuracy: Accuracy = None,
+    time: Time = None,
+    error: Error = None,
+    memory: Memory = None,
     changes: Changes = None,
     drop_invalid: DropInvalid = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     no_cache: NoCache = False,
 ) -> None:
-    """Simulate a scene and draw its video; a killed run goes on from its last frame."""
-    _run(scene, out, accuracy, changes, drop_invalid=drop_invalid, overwrite=overwrite)
+    """Simulate a scene and draw its video; a killed run goes on from its last frame.
+
+    With --time, --error or --memory it takes settings that keep them, see plan; with the same bounds it goes on from
+    the same settings only on a machine as fast, so write them down with plan -o for long runs.
+    """
+    budget = {"time": time, "error": error, "memory": memory}
+    _run(scene, out, accuracy, changes, drop_invalid=drop_invalid, overwrite=overwrite, budget=budget)
 
 
 def _run(
@@ -89,14 +95,20 @@ def _run(
     *,
     drop_invalid: bool = False,
     overwrite: bool = False,
+    budget: dict[str, Any] | None = None,
 ) -> None:
     prepare_jax()
-    from pigjax.scene import load_scene, run_scene
+    from pigjax.scene import load_scene, plan_scene, run_scene
     from pigjax.scene.decode import settings_from
 
     scene = load_scene(path, accuracy=accuracy, changes=settings_from(changes))
     if drop_invalid:
         scene = structs.replace(scene, input=structs.replace(scene.input, drop_invalid=True))
+    planned = None
+    if any(bound is not None for bound in (budget or {}).values()):
+        planned = plan_scene(scene, **(budget or {}))
+        scene = planned.scene
+        console.print(said(f"settings: {', '.join(planned.settings) or 'those of the file'}"), soft_wrap=True)
     with progress() as bar:
         tasks: dict[str, TaskID] = {}
         told: list[str] = []
@@ -110,7 +122,7 @@ def _run(
             told.append(line)
             console.print(said(line), soft_wrap=True)
 
-        report = run_scene(scene, out, progress=tell, say=say, overwrite=overwrite)
+        report = run_scene(scene, out, progress=tell, say=say, overwrite=overwrite, planned=planned)
     table = Table("stage", "run s", "compile s")
     for name, spent in report.times.items():
         table.add_row(*row(name, f"{spent.run:.1f}", f"{spent.compile:.1f}"))
@@ -135,7 +147,7 @@ def view(
     port: Annotated[int, typer.Option(help="First port to try.", min=0, max=65535)] = 8080,
     browser: Annotated[bool, typer.Option(help="Open the page in a browser.")] = True,
     splats: Annotated[int, typer.Option(help="Most splats that the page draws.", min=1)] = 250_000,
-    accuracy: AccuracyOption = None,
+    accuracy: Accuracy = None,
     frames: Annotated[int, typer.Option(help="With -o: frames of one round.", min=1)] = 48,
     size: Annotated[int, typer.Option(help="With -o: edge of the pictures in pixels.", min=16, max=16384)] = 480,
     elevation: Annotated[float, typer.Option(help="With -o: of the camera, in degrees.", min=-89, max=89)] = 25.0,

@@ -131,7 +131,7 @@ def _is(value: Any, kind: str) -> bool:
     if kind.startswith("tuple["):
         inner = kind.removeprefix("tuple[").removesuffix("]").split(", ")
         return isinstance(value, tuple) and len(value) == len(inner) and all(map(_is, value, inner))
-    if kind.startswith("Float["):
+    if kind.startswith(("Float[", "Scalar")):
         return is_numeric(value)
     return kind != "str" or isinstance(value, str)
 

@@ -74,9 +74,9 @@ class Force(eqx.Module):
             raise InputError(
                 f"{name}.region is {type(self.region).__name__}: give a BoxRegion, SphereRegion, HalfSpace."
             )
-        both = (self.start, self.end)
-        if None not in both and is_known(both) and float(self.end) < float(self.start):  # type: ignore[arg-type]
-            raise InputError(f"{name}.end = {float(self.end)}: it must not be before start = {float(self.start)} s.")  # type: ignore[arg-type]
+        start, end = self.start, self.end
+        if start is not None and end is not None and is_known((start, end)) and float(end) < float(start):
+            raise InputError(f"{name}.end = {float(end)}: it must not be before start = {float(start)} s.")
 
     def acceleration_of(self, x: Points, v: Points, time: Time) -> Points:
         """Acceleration of matter [m/s²].

@@ -15,6 +15,7 @@ from pigjax.core.extent import scene_extent
 from pigjax.mpm import Particles
 from pigjax.mpm.materials import MaterialTable
 from pigjax.scene.accuracy import LEVELS
+from pigjax.scene.costs import Prediction, Required, duration
 from pigjax.scene.schema import Scene
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians
@@ -26,7 +27,6 @@ _SAGS, _FLOWS = 0.3, 1.5  # weight over stiffness from which matter visibly sags
 _FIRM = 0.03  # the ratio that the advised stiffness has
 _LOOSE = ("fluid", "foam", "snow")  # laws whose matter is meant to flow or to crush
 _MANY = 300_000  # particles that deserve a warning
-_STEP_TIME = {"cpu": 2e-7, "gpu": 4e-9, "tpu": 4e-9}  # of a particle and substep, on one device [s]; docs/results
 
 
 def default_dx(scene: Scene, gaussians: Gaussians, labels: Labels, ids: Mapping[str, int]) -> float:
@@ -79,27 +79,25 @@ def remarks_on(
     ]
 
 
-def plan_line(scene: Scene, particles: Particles, dx: float, *, substeps: int, integrator: str) -> str:
+def plan_line(needs: Required, prediction: Prediction) -> str:
     """The work that a run will do, in one line: particles first.
 
     Args:
-        scene: its frames and objects.
-        particles: at the start.
-        dx: grid spacing [m].
-        substeps: of the first frame.
-        integrator: of the steps; the time of implicit ones is not foretold.
+        needs: of the run.
+        prediction: of its time; that of implicit steps is not told, as the solver's work is not known.
     """
-    moving = [name for name, entry in scene.objects.items() if not entry.fixed]
-    each = ", ".join(f"{name} {number:,}" for name, number in zip(moving, particles.counts))
-    frames, count = scene.simulation.frames, len(particles)
-    where = jax.default_backend()
-    seconds = frames * substeps * count * _STEP_TIME.get(where, 2e-7)
-    seconds /= jax.local_device_count()
-    line = f"{count:,} particles ({each}) on a grid of dx = {dx:g} m, {frames} frames of {substeps} substeps"
-    return line + (
-        ""
-        if integrator == "implicit"
-        else f": about {_duration(seconds)} of simulation on this {where}, then the drawing"
+    each = ", ".join(f"{body.name} {body.particles:,}" for body in needs.bodies)
+    about = "about " if needs.guessed else ""
+    line = (
+        f"{about}{needs.particles:,} particles ({each}) on a grid of dx = {needs.dx:g} m, {needs.frames} frames of"
+        f" {needs.substeps} substeps"
+    )
+    if needs.integrator == "implicit":
+        return line
+    here = "" if prediction.probed else f" on a {jax.default_backend()}"
+    return (
+        f"{line}: about {duration(prediction.run['simulate'])} of simulation and {duration(prediction.run['draw'])} of"
+        f" drawing{here}, and {duration(prediction.compile_seconds)} to compile what is not kept"
     )
 
 
@@ -178,9 +176,3 @@ def _many(scene: Scene, count: int, dx: float) -> Iterator[str]:
 def _rounded(value: float) -> float:
     """Two significant digits."""
     return float(f"{value:.2g}")
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{max(seconds, 1):.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

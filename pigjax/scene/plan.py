@@ -303,8 +303,7 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels, *, gaussians_per_cel
         seed=spec.seed,
     )
     binding = bind(inputs.gaussians, labels, particles)
-    gravity = spec.gravity
-    vector = np.array(gravity) if isinstance(gravity, tuple) else -gravity * axis_of(scene.input.up)
+    vector = gravity_of(scene)
     frame_dt = 1 / (spec.fps * spec.slow_motion)
     lost = told(cut, {number: name for name, number in inputs.ids.items()})
     return Plan(
@@ -325,6 +324,12 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels, *, gaussians_per_cel
         remarks=[*lost, *remarks_on(scene, particles, table, vector, dx)],
         labels=labels,
     )
+
+
+def gravity_of(scene: Scene) -> Float[np.ndarray, "3"]:
+    """The scene's gravity as a vector [m/s²]."""
+    gravity = scene.simulation.gravity
+    return np.array(gravity) if isinstance(gravity, tuple) else -gravity * axis_of(scene.input.up)
 
 
 def clamp_params(spec: ClampSpec) -> ClampParams:

@@ -40,6 +40,8 @@ class RunReport:
     modelled: dict[str, Any] = field(default_factory=dict)  # laws, colliders, kernel, ... that the scene traced
     sizes: dict[str, Any] = field(default_factory=dict)  # counts of Gaussians, particles, frames, substeps; mass [kg]
     times: dict[str, StageTime] = field(default_factory=dict)  # by stage
+    predicted: dict[str, Any] = field(default_factory=dict)  # times, memory, error before the run; what it required
+    estimated_error: dict[str, Any] = field(default_factory=dict)  # by a coarser grid; empty: not asked for
     health: dict[str, Any] = field(default_factory=dict)  # extremes of all frames, energies [J] by frame
     warnings: list[str] = field(default_factory=list)  # each once
     files: dict[str, str] = field(default_factory=dict)  # path of each result, by name

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import math
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
@@ -62,7 +63,7 @@ def report_page(
     parts += ["<h2>Modelled</h2>", _table(_modelled(scene, report))]
     parts += ["<h2>Left out</h2>", "<ul>", *(f"<li>{escape(text)}</li>" for text in left_out(scene, report)), "</ul>"]
     parts += ["<h2>Objects</h2>", _objects(scene, report), "<h2>Times</h2>", _times(report)]
-    parts += ["<h2>Health</h2>", _health(report), _charts(scene, report)]
+    parts += ["<h2>Health</h2>", _estimated(report), _health(report), _charts(scene, report)]
     parts += ["<h2>Settings</h2>", "<p>Save as a scene file beside this page to reproduce the run.</p>"]
     parts += [f"<pre>{escape(settings)}</pre>", "<h2>Versions</h2>", _table(_versions())]
     return (
@@ -130,9 +131,27 @@ def _objects(scene: Scene, report: RunReport) -> str:
 
 
 def _times(report: RunReport) -> str:
-    rows = [(name, f"{t.run:.2f}", f"{t.compile:.2f}", f"{t.total:.2f}") for name, t in report.times.items()]
+    rows: list[tuple[str, ...]] = [
+        (name, f"{t.run:.2f}", f"{t.compile:.2f}", f"{t.total:.2f}") for name, t in report.times.items()
+    ]
     total = [sum(getattr(t, part) for t in report.times.values()) for part in ("run", "compile", "total")]
-    return _rows(("stage", "run s", "compile s", "total s"), [*rows, ("all", *(f"{value:.2f}" for value in total))])
+    rows.append(("all", *(f"{value:.2f}" for value in total)))
+    if told := report.predicted:
+        run, compiling = (math.fsum(told[part].values()) for part in ("run_s", "compile_s"))
+        where = "predicted" if told["probed"] else "predicted for another machine"
+        rows.append((where, f"{run:.2f}", f"{compiling:.2f}", f"{told['total_s']:.2f}"))
+    return _rows(("stage", "run s", "compile s", "total s"), rows)
+
+
+def _estimated(report: RunReport) -> str:
+    found = report.estimated_error
+    if not found:
+        return ""
+    return (
+        f"<p>Estimated error of the motion by grid and time step: {100 * found['error_of_distance']:.2g} % of the"
+        f" distance travelled, {found['error_m']:.2g} m after {found['frames']} frames (a second run on a grid of"
+        f" {found['coarser_dx']:.3g} m).</p>"
+    )
 
 
 def _health(report: RunReport) -> str:

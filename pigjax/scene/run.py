@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -27,14 +27,18 @@ from pigjax.mpm.sleep import Sleeper
 from pigjax.objects.overlay import legend_sheet, overlay
 from pigjax.scene.advice import plan_line
 from pigjax.scene.arrangement import arrange
+from pigjax.scene.budget import ScenePlan, refined
+from pigjax.scene.costs import Comparison, Pace, Prediction, predict
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
 from pigjax.scene.own import MADE, Liquids, chosen, is_torn, laws_of, liquids_of, with_own
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
 from pigjax.scene.replay import COLLIDER_FILE, REST_FILE, SCENE_FILE, rows_of, store_colliders, store_rest
 from pigjax.scene.report import RunReport
 from pigjax.scene.report_page import report_page
+from pigjax.scene.required import counted
+from pigjax.scene.run_error import Followed, estimated_error
 from pigjax.scene.schema import Scene, values_of
-from pigjax.scene.stages import simulate_stages, stages_of
+from pigjax.scene.stages import Stage, simulate_stages, stages_of
 from pigjax.scene.world import described
 from pigjax.segmentation import Labels, pixel_ids
 from pigjax.splat import Gaussians, render
@@ -56,6 +60,7 @@ def run_scene(
     progress: Progress | None = None,
     say: Say | None = None,
     overwrite: bool = False,
+    planned: ScenePlan | None = None,
 ) -> RunReport:
     """Simulate a scene and draw its video. Host.
 
@@ -72,6 +77,8 @@ def run_scene(
         say: told the plan (particles, grid, substeps, time expected) and remarks on the scene before it is simulated,
             a line each; they are in the report, too.
         overwrite: replace states in `out_dir` that were made from something else, instead of refusing them.
+        planned: of `plan_scene`; `scene` is usually its `scene`. The run then tells the time of this machine, and
+            compares it with the time spent, at each quarter of the simulation and at the end.
 
     Raises:
         StaleError: the states in `out_dir` were made from other settings or files; it names what changed.
@@ -84,7 +91,7 @@ def run_scene(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            _run(scene, out, report, tell, say or (lambda line: None), overwrite)
+            _run(scene, out, report, tell, say or (lambda line: None), overwrite, planned)
         except StaleError:
             raise  # report.json still tells of the results that are there
         except BaseException as error:
@@ -103,7 +110,15 @@ def _leave_report(
     io.write_text(out / "report.html", report_page(scene, report, settings=settings, sheet=report.sheet, error=error))
 
 
-def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, say: Say, overwrite: bool) -> None:
+def _run(
+    scene: Scene,
+    out: Path,
+    report: RunReport,
+    tell: Progress,
+    say: Say,
+    overwrite: bool,
+    planned: ScenePlan | None,
+) -> None:
     with report.stage("read"):
         inputs = read_inputs(scene)
         parts = provenance(scene, inputs)
@@ -116,7 +131,7 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, say: Say, o
         tell("segment", 1, 1)
     with report.stage("seed"):
         tell("seed", 0, 1)
-        plan = make_plan(scene, inputs, labels)
+        voted, plan = labels, make_plan(scene, inputs, labels)
         labels = plan.labels
         rows = rows_of(plan.particles, labels)
         made = _made_before(out / REST_FILE)
@@ -128,27 +143,71 @@ def _run(scene: Scene, out: Path, report: RunReport, tell: Progress, say: Say, o
     for remark in plan.remarks:
         say(f"note: {remark}")
     report.warnings += plan.remarks
-    states = _simulate(scene, plan, out / "states", parts, key, report, tell, say)
+    stages = stages_of(plan, scene.simulation.frames)
+    prediction = _predict(scene, inputs, plan, stages, report, planned)
+    say(report.plan)
+    told = say if planned is not None else None
+    states = _simulate(scene, plan, stages, out / "states", parts, key, report, tell, told, prediction)
+    followed = None
+    if frames := min(scene.output.error_frames, scene.simulation.frames):
+        followed = Followed(np.asarray(plan.particles.gaussian), frames, out / "states", key)
+        states = followed.along(states)
     if scene.output.states_every == 1:
         with report.stage("simulate"):
             for _ in states:
                 pass
-    liquids = None
+    seen, drawn, liquids = inputs, plan, None
     if any(entry.splats != "carried" for entry in scene.objects.values()):
         with report.stage("splats"):
             tell("splats", 0, 1)
             names = chosen(scene, laws_of(scene, plan), partial(_was_torn, scene, inputs, rows, out / "states", key))
-            inputs, plan, own = with_own(scene, inputs, plan, names, stored=made, say=say)
+            seen, drawn, own = with_own(scene, inputs, plan, names, stored=made, say=say)
             if names:
-                labels = plan.labels
-                _store(scene, inputs, plan, rows | {"gaussian": np.asarray(plan.particles.gaussian)}, out, key, own)
+                rows["gaussian"] = np.asarray(drawn.particles.gaussian)
+                _store(scene, seen, drawn, rows, out, key, own)
                 liquids = liquids_of(own["smooth"].tolist(), rows["object"], plan.particles.x, plan.dx)
                 report.sizes["own_splats_of"] = {
-                    name: int(np.sum(np.asarray(labels.object_id) == inputs.ids[name])) for name in names
+                    name: int(np.sum(np.asarray(drawn.labels.object_id) == inputs.ids[name])) for name in names
                 }
             tell("splats", 1, 1)
     with report.stage("draw"):
-        _draw(scene, inputs, plan, labels, out, key, report, tell, states, liquids)
+        _draw(scene, seen, drawn, drawn.labels, out, key, report, tell, states, liquids)
+    if followed is not None:
+        with report.stage("estimate"):
+            tell("estimate", 0, 1)
+            report.estimated_error |= estimated_error(scene, inputs, voted, plan, followed) or {}
+            tell("estimate", 1, 1)
+        if not report.estimated_error:
+            report.warnings.append(
+                "output.error_frames: nothing moved, or no state was there, so that no error is estimated."
+            )
+    _compare(report, prediction, told)
+
+
+def _predict(
+    scene: Scene, inputs: Inputs, plan: Plan, stages: list[Stage], report: RunReport, planned: ScenePlan | None
+) -> Prediction:
+    """What the run requires and will cost, told by the report."""
+    first = stages[0].rule
+    needs = counted(
+        scene, inputs, plan, substeps=first.first, integrator=first.config.integrator,
+        voted=inputs.stored is None and inputs.views is not None,
+    )  # fmt: skip
+    prediction = predict(needs) if planned is None else refined(planned, needs)
+    report.plan = plan_line(needs, prediction)
+    report.predicted |= prediction.as_dict() | {"required": {**asdict(needs), "bodies": list(map(list, needs.bodies))}}
+    return prediction
+
+
+def _compare(report: RunReport, prediction: Prediction, say: Say | None) -> None:
+    """The time spent beside the prediction; a run that went on from saved states did only a part."""
+    spent = Comparison(
+        prediction,
+        {name: t.run for name, t in report.times.items()},
+        {name: t.compile for name, t in report.times.items()},
+    )
+    if say is not None and not report.sizes.get("resumed_from_frame"):
+        say(spent.line())
 
 
 def _store(
@@ -237,7 +296,16 @@ def _particles_of(
 
 
 def _simulate(
-    scene: Scene, plan: Plan, folder: Path, parts: dict[str, str], key: str, report: RunReport, tell: Progress, say: Say
+    scene: Scene,
+    plan: Plan,
+    stages: list[Stage],
+    folder: Path,
+    parts: dict[str, str],
+    key: str,
+    report: RunReport,
+    tell: Progress,
+    say: Say | None,
+    prediction: Prediction,
 ) -> Iterator[int]:
     """Simulate the frames that are not on disk yet, from the last checkpoint on; yields the last one that is there.
 
@@ -247,13 +315,8 @@ def _simulate(
     present = io.readable_states(folder, signature=key)
     checkpoint = folder / "last.ckpt"
     active = ActiveGrid() if plan.sleep is None else Sleeper(settings=plan.sleep, body=np.asarray(particles.body))
-    stages = stages_of(plan, frames)
     run = partial(simulate_stages, plan, stages, active_grid=active)
     config = stages[-1].rule.config
-    report.plan = plan_line(
-        scene, particles, plan.dx, substeps=stages[0].rule.first, integrator=stages[0].rule.config.integrator
-    )
-    say(report.plan)
     saved = io.resumed(checkpoint, (np.zeros((), np.int64), particles, active.memory()), parts=parts)
     last = 0 if saved is None else int(saved[0])
     missing = set(range(last + 1)) - present  # of a run without a checkpoint all frames from the first are made again
@@ -280,6 +343,7 @@ def _simulate(
             yield from run(resumed, frames=range(last, frames))
 
     tell("simulate", 0 if repaired else last, frames)
+    pace = Pace(prediction, frames, scene.output.states_every == 1)
     yield 0 if repaired else last
     for frame, after, _, health in todo():
         records[frame] = record = health_record(after, health, plan.gravity)
@@ -295,6 +359,8 @@ def _simulate(
             _checkpoint(checkpoint, frame, after, active, parts)
         if frame < frames:
             tell("simulate", frame, frames)
+        if say is not None and saved is None and (line := pace.line(frame)):
+            say(line)
         yield frame
     tell("simulate", frames, frames)
     most = max((int(record["substeps"]) for frame, record in records.items() if frame), default=stages[0].rule.first)

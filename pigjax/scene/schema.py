@@ -154,6 +154,8 @@ class OutputSpec(Section, frozen=True):
     # frames from one kept state to the next, the last frame's beside them; 0: none, and a killed run begins again
     states_every: Annotated[int, Limits(0, 100_000)] = 1
     compress_states: bool = False  # deformation and velocity in half precision, deflated: half the size
+    # first frames that are simulated once more on a grid of 1.5 times the spacing, for the report's `estimated_error`
+    error_frames: Annotated[int, Limits(0, 100_000)] = 0
 
 
 class ObjectSpec(Section, frozen=True, kw_only=True):

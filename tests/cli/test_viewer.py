@@ -153,7 +153,7 @@ def test_splats_labels_scenes_and_folders_are_told_apart(folder, tmp_path):
 def test_a_draft_edits_objects_world_and_ground_and_writes_what_a_run_reads(folder, tmp_path):
     opened = open_path(folder / "scene.toml")
     draft = Draft(opened.values, opened.base, tmp_path)
-    draft.rename("ball", "melon", 1)
+    draft.name_object("ball", "melon", 1)
     draft.set_number("melon", "young", 5432.1)
     draft.set_velocity("melon", (0, 0, 1 / 3))
     draft.set_gravity((0, 0, -1.62))
@@ -180,7 +180,7 @@ def test_a_draft_refuses_what_a_scene_cannot_be_and_stays_as_it_was(folder):
         (lambda: draft.set_number("ball", "colour", 1.0), "unknown field"),
         (lambda: draft.set_gravity((0, 0, 1e30)), "simulation.gravity"),
         (lambda: draft.set_material("ball", "gold"), "choose one of jelly"),
-        (lambda: draft.rename("ball", " ", 1), "a name is empty"),
+        (lambda: draft.name_object("ball", " ", 1), "a name is empty"),
         (lambda: draft.add("ball", 2), "is there already"),
         (lambda: draft.set_ground((0, 0, 0), (0, 0, 0)), "planes.ground.normal"),
     ):
@@ -191,7 +191,7 @@ def test_a_draft_refuses_what_a_scene_cannot_be_and_stays_as_it_was(folder):
         draft.write("scene.toml")
 
 
-@pytest.mark.parametrize("name", ["../evil", "/tmp/evil", "a/b", "..", "x\0y", ""])
+@pytest.mark.parametrize("name", ["../evil", "/evil", "a/b", "..", "x\0y", ""])
 def test_nothing_is_written_outside_of_the_opened_folder(folder, tmp_path, name):
     home = tmp_path / "inside"
     draft = Draft(open_path(folder / "scene.toml").values, folder, home)
@@ -315,7 +315,7 @@ def test_a_live_simulation_falls_is_dragged_changes_matter_and_goes_back(folder)
     # a hand above takes hold and lifts against gravity
     place = live.grab(np.asarray(live.particles.x)[0], strength=5.0)
     assert live.holds
-    live.move(place + np.array([0, 0, 0.3]))
+    live.drag_to(place + np.array([0, 0, 0.3]))
     before = float(live.held[2])
     for _ in range(4):
         session.step_live()

@@ -45,6 +45,10 @@ SCENE = {
     "spheres": {"ball": {"centre": [0, 0, 0], "radius": 1.0}},
     "capsules": {"rod": ROUND},
     "cylinders": {"disc": ROUND},
+    "pinned": {"rim": {"centre": [0, 0, 0.3], "radius": 0.1}},
+    "forces": {"breeze": {"kind": "wind", "velocity": [1, 0, 0], "drag": 2.0}},
+    "world": {},
+    "output": {},
 }
 STUDY = {
     "scene": "scene.toml",
@@ -88,7 +92,7 @@ def assert_in_range(kind, made):
             if isinstance(part, Section):
                 assert_in_range(type(part), part)
     for name, _, limits in numbers_of(kind):
-        if (value := getattr(made, name)) is not None and np.size(value):
+        if (value := getattr(made, name)) is not None and not isinstance(value, str) and np.size(value):
             for part in value if isinstance(value, list) else [value]:
                 assert limits.broken(part) is None, (kind, name, value)
 

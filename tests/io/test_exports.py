@@ -186,7 +186,8 @@ def test_usd_has_a_time_sample_for_each_frame_that_moves(tmp_path, frames):
     turns = [np.asarray(field.GetOrientationsAttr().Get(frame)) for frame in range(4)]
     assert all(((a * b).sum(1) >= 0).all() for a, b in pairwise(turns)), "the long way round between frames"
     low, high = np.asarray(field.GetExtentAttr().Get(2))
-    assert (low < frames[1].means.min(0)).all() and (high > frames[1].means.max(0)).all()  # noqa: PT018
+    assert (low < frames[1].means.min(0)).all()
+    assert (high > frames[1].means.max(0)).all()
     back = io.read_usd(tmp_path / "a.usdc", frame=2)
     np.testing.assert_allclose(back["means"], frames[1].means + jnp.asarray([10.0, 0, 0]), atol=1e-6)
 

@@ -54,7 +54,7 @@ def test_jax_uint8_and_grey_frames_are_films(tmp_path):
 @pytest.mark.parametrize(
     ("name", "frames", "fps", "message"),
     [
-        ("a.avi", np.zeros((1, 2, 2, 3)), 10, r"a\.avi: unknown video suffix '\.avi'; use \.mp4 or \.gif"),
+        ("a.avi", np.zeros((1, 2, 2, 3)), 10, r"a\.avi: unknown video suffix '\.avi'; use \.mp4, \.webm or \.gif"),
         ("a.mp4", np.zeros((1, 2, 2, 3)), 0, r"a\.mp4: fps = 0; it must be > 0"),
         ("a.mp4", [], 10, r"a\.mp4: no frames were given"),
         ("a.gif", [], 10, r"a\.gif: no frames were given"),

@@ -367,7 +367,7 @@ import sys, time
 from pigjax import cli
 from pigjax import io
 from pigjax.cli import segmenting
-def slow(path):
+def slow(path, **_):
     with io.writing(path) as partial:
         partial.write_text("half")
         print("ready", flush=True)
@@ -396,7 +396,7 @@ def test_a_command_stopped_while_libraries_load_says_its_sentence(tmp_path):
 
 
 def test_errors_of_the_system_are_one_line(command, monkeypatch):
-    def fail(path):
+    def fail(path, **_):
         raise OSError(errno.EIO, os.strerror(errno.EIO), "some.ply")
 
     monkeypatch.setattr(segmenting, "describe_file", fail)

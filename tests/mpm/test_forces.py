@@ -226,27 +226,26 @@ def pulled():
 
 
 def test_gradients_are_central_differences(pulled):
-    """By every number of every force but the place of a region: a hard border."""
+    """By all numbers of each force at once, but the place of a region: a hard border."""
     particles, table, forces, _, gradient, _ = pulled
     loss, random = jax.jit(loss_of(particles, table)), np.random.default_rng(5)
-    found = dict(jax.tree_util.tree_leaves_with_path(gradient))
-    for path, leaf in jax.tree_util.tree_leaves_with_path(forces):
-        name = jax.tree_util.keystr(path)
-        if ".region" in name:
-            continue
-        along = jnp.asarray(random.normal(size=leaf.shape))
-        size = 1e-5 * max(1.0, float(jnp.abs(leaf).max()))
-        values = []
-        for shift in (size, -size):
-            other = jax.tree_util.tree_map_with_path(
-                lambda at, own, path=path, along=along, shift=shift: own + shift * along if at == path else own, forces
-            )
-            values.append(float(loss(other)[0]))
-        expected = (values[0] - values[1]) / (2 * size)
-        np.testing.assert_allclose(
-            (found[path] * along).sum(), expected, rtol=2e-5, atol=1e-9, err_msg=jax.tree_util.keystr(path)
+    for k, force in enumerate(forces):
+        along = jax.tree_util.tree_map_with_path(
+            lambda at, leaf: (
+                jnp.zeros_like(leaf)
+                if ".region" in jax.tree_util.keystr(at)
+                else max(1.0, float(jnp.abs(leaf).max())) * jnp.asarray(random.normal(size=leaf.shape))
+            ),
+            force,
         )
-        assert abs(expected) > 1e-9, path
+        values = []
+        for shift in (1e-5, -1e-5):
+            moved = jax.tree.map(lambda own, way, shift=shift: own + shift * way, force, along)
+            values.append(float(loss((*forces[:k], moved, *forces[k + 1 :]))[0]))
+        slope = sum(jnp.vdot(own, way) for own, way in zip(jax.tree.leaves(gradient[k]), jax.tree.leaves(along)))
+        expected = (values[0] - values[1]) / 2e-5
+        np.testing.assert_allclose(slope, expected, rtol=2e-5, atol=1e-9, err_msg=type(force).__name__)
+        assert abs(expected) > 1e-9, force
 
 
 @pytest.mark.slow
@@ -355,8 +354,6 @@ def test_wrong_forces_are_refused_by_name():
         Wind(NONE, -1.0)
     with pytest.raises(InputError, match=r"Spring\.end = 1\.0: it must not be before start = 2\.0 s"):
         Spring(NONE, 1.0, start=2.0, end=1.0)
-    with pytest.raises(InputError, match=r"ForceField\.region is tuple"):
-        ForceField(NONE, region=(1, 2))
     with pytest.raises(InputError, match=r"Wind\.weights has shape \(3,\): give one weight for each of the 64"):
         run(particles, table, (Wind(NONE, 1.0, weights=jnp.ones(3)),))
     with pytest.raises(InputError, match="grab: radius = 0"):

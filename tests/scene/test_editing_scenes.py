@@ -19,9 +19,11 @@ from pigjax.mpm.active_grid import ActiveGrid
 from pigjax.scene import RunReport, scene_from
 from pigjax.scene.advice import default_dx, plan_line
 from pigjax.scene.arrangement import arrange
+from pigjax.scene.costs import predict
 from pigjax.scene.framing import framing_camera
 from pigjax.scene.plan import make_plan, read_inputs, segment
 from pigjax.scene.report_page import _modelled
+from pigjax.scene.required import counted
 from pigjax.scene.stages import simulate_stages, stages_of
 from pigjax.segmentation import Labels
 
@@ -148,7 +150,8 @@ def test_dx_has_a_default_and_the_plan_says_the_work(tmp_path):
     assert default_dx(draft, inputs.gaussians, plan.labels, inputs.ids) == pytest.approx(1.5 * plan.dx, rel=0.05)
     told = _modelled(scene, RunReport(sizes={"dx": plan.dx}))
     assert told["grid spacing"] == f"{plan.dx:g} m"
-    line = plan_line(scene, plan.particles, plan.dx, substeps=40, integrator="explicit")
+    needs = counted(scene, inputs, plan, substeps=40, integrator="explicit", voted=False)
+    line = plan_line(needs, predict(needs))
     assert line.startswith(f"{len(plan.particles):,} particles (ball {len(plan.particles):,}) on a grid of dx = ")
     assert "3 frames of 40 substeps: about " in line
 

@@ -54,7 +54,7 @@ class Draft:
         self._check_free(name)
         self.objects[name] = {"id": number, "fixed": True}
 
-    def rename(self, old: str, new: str, number: int) -> None:
+    def name_object(self, old: str, new: str, number: int) -> None:
         """Give an object another name. Its id is written down, since the masks do not know the new name.
 
         Raises:

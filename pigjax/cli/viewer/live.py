@@ -114,7 +114,7 @@ class Live:
         self.hand = grab(self.particles, np.asarray(point, float), radius=_REACH * self.dx, frequency=frequency)
         return np.asarray(self.hand.target, float)
 
-    def move(self, target: Any) -> None:
+    def drag_to(self, target: Any) -> None:
         """Move the hand [m]; where nothing is held it has no effect."""
         kind = self.particles.x.dtype
         self.hand = eqx.tree_at(lambda hand: hand.target, self.hand, jnp.asarray(target, kind))

@@ -33,7 +33,7 @@ class Page:
     def __init__(self, session: Session, server: Any) -> None:
         self.session, self.server = session, server
         self.playing = False
-        self.stale = False  # whether the scene was changed in a way that a restart is needed for
+        self.stale = False  # whether a change of the scene needs a restart
         self._pending: dict[str, Callable[[], None]] = {}
         self._wake = threading.Condition()
         self._closing = False
@@ -155,7 +155,7 @@ class Page:
         else:
             if not live.holds:
                 live.grab(np.asarray(live.particles.x)[particle], strength=self.strength.value)
-            live.move(place)
+            live.drag_to(place)
         if not self.playing:
             self.stage.push_extras()
 
@@ -364,7 +364,7 @@ class Page:
     def _rename(self) -> None:
         old, new = self.session.name_of(self._selected), self.name.value.strip()
         if old in self.session.draft.objects:
-            self.session.draft.rename(old, new, self._selected)
+            self.session.draft.name_object(old, new, self._selected)
         if new:
             self.session.opened.names[self._selected] = new
             self.object.options = self._names()

@@ -12,7 +12,7 @@ _FAR = 3.0  # standard deviations beyond which a splat is not met
 
 
 class Hit(NamedTuple):
-    """What a ray meets first."""
+    """The nearest hit of a ray."""
 
     row: int  # of the splat or particle
     point: Float[np.ndarray, "3"]  # [m]

@@ -44,6 +44,7 @@ def start_server(host: str = LOCAL, port: int = 8080) -> Any:
             server = viser.ViserServer(host=host, port=port, verbose=False)
         except (OSError, RuntimeError, OverflowError) as error:
             raise InputError(f"--host {host} --port {port}: cannot be listened on ({error}).") from None
+    # a share link would lead through a server outside of this machine; viser has no option against it
     server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
     server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large", dark_mode=False)
     return server

@@ -82,7 +82,7 @@ class _Moment:
 
 @dataclass
 class Session:
-    """What a page shows, and what its controls change.
+    """State of a page: the scene shown, and the values of its controls.
 
     Args:
         opened: of `open_path`.

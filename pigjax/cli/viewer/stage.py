@@ -1,4 +1,4 @@
-"""What the page draws: nodes of viser for splats, particles, colliders, the hand, the ground."""
+"""The drawing of a page: nodes of viser for splats, particles, colliders, the hand, the ground."""
 
 from __future__ import annotations
 

@@ -1,0 +1,233 @@
+"""Predictions of `pigjax plan` beside measurements, and the fit of their prices.
+
+`fit` runs small scenes, each in a process of its own without kept programs, and fits the prices of
+pigjax/scene/costs.json, which `--write` replaces; prices that no scene needs stay as they are. `check` plans and runs
+scenes that were not fitted on.
+"""
+
+import json
+import os
+import tempfile
+from datetime import date
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import nnls
+
+from benchmarks.common.command import start_worker
+from benchmarks.common.pages import EXAMPLES, ROOT, head, row
+from benchmarks.common.timing import machine, peak_memory
+from pigjax.io.compile_cache import SWITCH
+from pigjax.scene import costs, plan_scene, run_scene, scene_from
+from pigjax.scene.probe import probe
+
+PRICES = ROOT / "pigjax" / "scene" / "costs.json"
+_TRUST = 0.1  # weight of the prices so far against that of one measurement
+_COLD = {SWITCH: "off", "JAX_ENABLE_COMPILATION_CACHE": "false"}
+
+
+class Case(NamedTuple):
+    """A scene to run: a law of the cube that `tradeoff` makes, or a file of examples, with fields changed."""
+
+    source: str
+    changes: dict[str, dict[str, Any]]
+
+
+FITTED = {
+    "jelly cube": Case("elastic", {}),
+    "jelly cube, fine": Case("elastic", {"simulation": {"dx": 0.0125, "frames": 4}}),
+    "jelly cube, large pictures": Case("elastic", {"simulation": {"frames": 3}, "camera": {"width": 512}}),
+    "sand cube": Case("sand", {}),
+    "sand cube, fine": Case("sand", {"simulation": {"dx": 0.0125, "frames": 3}}),
+    "tabletop": Case("tabletop/scene.toml", {"simulation": {"dx": 0.02, "frames": 4}}),
+}
+CHECKED = {
+    "breeze": Case("gallery/breeze.toml", {"simulation": {"frames": 12}}),
+    "honey": Case("materials/honey.toml", {"simulation": {"frames": 8}}),
+    "muscle": Case("materials/muscle.toml", {"simulation": {"frames": 8}}),
+    "snow": Case("materials/snow.toml", {"simulation": {"frames": 8}}),
+    "sand": Case("materials/sand.toml", {"simulation": {"frames": 8}}),
+    "tabletop, draft": Case("tabletop/scene.toml", {"simulation": {"dx": 0.018, "cfl": 0.8, "frames": 8},
+                                                    "drawing": {"scale": 0.5}}),
+}  # fmt: skip
+
+
+class Measured(NamedTuple):
+    """One run."""
+
+    needs: costs.Required
+    run: dict[str, float]  # [s] by stage
+    compile: dict[str, float]
+    memory: float  # [bytes]
+    probe: dict[str, float]  # [s]
+    error: float | None  # of the motion, by a coarser grid
+    planned: dict[str, Any] | None  # the prediction before the run
+
+
+def fit(options) -> None:
+    """Run the scenes of the fit, print their times beside those of the fitted prices, and write these."""
+    runs = {}
+    for name in options.fitted:
+        if (found := _child(name, planned=False)) is not None:
+            runs[name] = found
+    before = json.loads(PRICES.read_text())
+    if not runs:
+        print("no scene ran; the prices stay as they are")
+        return
+    fitted = fitted_prices(before, list(runs.values()))
+    fitted["source"] = f"{machine()}, {date.today().isoformat()}, by `python -m benchmarks plan fit`"
+    prices = costs.prices_from(fitted)
+    print(head("scene", "particles", *(f"{stage} s" for stage in costs.STAGES), "all s", "compile s", "GB"))
+    for name, found in runs.items():
+        guess = costs.predict(found.needs, prices)
+        stages = [f"{guess.run[stage]:.2f} / {found.run.get(stage, 0):.2f}" for stage in costs.STAGES]
+        whole = f"{guess.run_seconds:.1f} / {sum(found.run.values()):.1f}"
+        compiled = f"{guess.compile_seconds:.0f} / {sum(found.compile.values()):.0f}"
+        memory = f"{guess.memory / 1e9:.2f} / {found.memory / 1e9:.2f}"
+        print(row(name, f"{found.needs.particles:,}", *stages, whole, compiled, memory))
+    print("\nFitted / measured.")
+    if options.write:
+        PRICES.write_text(json.dumps(fitted, indent=1) + "\n")
+        print(f"\nWritten to `{PRICES.relative_to(ROOT)}`.")
+
+
+def fitted_prices(before: dict[str, Any], runs: list[Measured]) -> dict[str, Any]:
+    """Prices that are >= 0 and make the relative errors of all runs least, near those before where runs say little.
+
+    Args:
+        before: values of costs.json.
+        runs: measured.
+    """
+    after = json.loads(json.dumps(before))
+    for kind, parts_of in (("run", costs.run_parts), ("compile", costs.compile_parts)):
+        for stage in costs.STAGES:
+            amounts = [{p.name: p.amount for p in parts_of(r.needs) if p.stage == stage} for r in runs]
+            times = [getattr(r, kind).get(stage, 0.0) for r in runs]
+            known = before[kind].get(stage, {})
+            if known:
+                after[kind][stage] = least_squares(known, amounts, times)
+    memory = [costs.memory_parts(r.needs) for r in runs]
+    after["memory"] = least_squares(before["memory"], memory, [r.memory for r in runs])
+    after["probe"] = {name: float(np.median([r.probe[name] for r in runs])) for name in runs[0].probe}
+    return after
+
+
+def least_squares(known: dict[str, float], amounts: list[dict[str, float]], values: list[float]) -> dict[str, float]:
+    """Prices x >= 0 with amounts · x near the values, relatively, and x near the known ones, relatively.
+
+    Args:
+        known: prices so far, by name.
+        amounts: of each run, by name; names that have no price are left out.
+        values: of each run; runs with 0 say nothing.
+    """
+    names = list(known)
+    scale = np.array([max(abs(known[name]), 1e-12) for name in names])
+    rows = [
+        (np.array([amount.get(name, 0.0) for name in names]) * scale / value, 1.0)
+        for amount, value in zip(amounts, values) if value > 0
+    ]  # fmt: skip
+    matrix = np.array([*(r for r, _ in rows), *(_TRUST * np.eye(len(names)))])
+    target = np.array([*(v for _, v in rows), *([_TRUST] * len(names))])
+    found, _ = nnls(matrix, target)
+    return {name: float(f"{value:.3g}") for name, value in zip(names, found * scale)}
+
+
+def check(options) -> None:
+    """Plan and run scenes that the prices were not fitted on, each in a process of its own."""
+    print(f"Prices: {costs.shipped_prices().source}.\n")
+    print(head("scene", "particles", "run s", "compile s", "GB", "error of motion"))
+    ratios: dict[str, list[float]] = {"run": [], "compile": [], "memory": [], "error": [], "particles": []}
+    for name in options.checked:
+        found = _child(name, planned=True)
+        if found is None or found.planned is None:
+            print(row(name, *["failed"] * 5))
+            continue
+        plan = found.planned
+        pairs = {
+            "particles": (plan["particles"], found.needs.particles),
+            "run": (sum(plan["run_s"].values()), sum(found.run.values())),
+            "compile": (sum(plan["compile_s"].values()), sum(found.compile.values())),
+            "memory": (plan["memory_GB"], found.memory / 1e9),
+        }
+        if found.error is not None:
+            pairs["error"] = (plan["error_of_distance"], found.error)
+        for key, (guess, true) in pairs.items():
+            ratios[key].append(guess / true)
+        told = {key: f"{guess:.3g} / {true:.3g} ({guess / true:.2f})" for key, (guess, true) in pairs.items()}
+        print(row(name, *(told.get(key, "") for key in ("particles", "run", "compile", "memory", "error"))))
+    print("\nPredicted / measured (ratio). Of all scenes, the largest factor between the two:\n")
+    for key, found in ratios.items():
+        if found:
+            print(f"- {key}: {np.exp(np.abs(np.log(found)).max()):.2f}")
+
+
+def _child(name: str, *, planned: bool) -> Measured | None:
+    """Run a scene in a process of its own."""
+    child = start_worker("plan", name, "planned" if planned else "", env={**os.environ, **_COLD})
+    said, _ = child.communicate()
+    lines = said.strip().splitlines()
+    if child.returncode or not lines:
+        return None
+    values = json.loads(lines[-1])
+    needs = values.pop("needs")
+    needs["bodies"] = tuple(costs.Body(*body) for body in needs["bodies"])
+    return Measured(costs.Required(**needs), **values)
+
+
+def worker(name: str, planned: str = "") -> None:
+    """Plan and run one scene, and print what was measured as JSON."""
+    from benchmarks.common.timing import use_host_devices
+
+    use_host_devices()
+    case = (CHECKED if planned else FITTED)[name]
+    fast = probe()
+    with tempfile.TemporaryDirectory() as folder:
+        scene = scene_of(case, estimate=bool(planned))
+        guess = None
+        if planned:
+            found = plan_scene(scene)
+            guess = found.prediction.as_dict() | {"particles": found.required.particles}
+        report = run_scene(scene, Path(folder) / "out")
+    stages = {k: t for k, t in report.times.items() if k in costs.STAGES}
+    values = {
+        "needs": report.predicted["required"],
+        "run": {stage: time.run for stage, time in stages.items()},
+        "compile": {stage: time.compile for stage, time in stages.items()},
+        "memory": peak_memory() * 1e9,
+        "probe": dict(fast),
+        "error": report.estimated_error.get("error_of_distance"),
+        "planned": guess,
+    }
+    print(json.dumps(values))
+
+
+def scene_of(case: Case, *, estimate: bool = False):
+    """The scene of a case.
+
+    Args:
+        case: source and changes.
+        estimate: whether its frames are simulated again for the estimated error.
+    """
+    from benchmarks.tradeoff.scenes import SMALL, source
+    from pigjax.io import read_toml
+
+    if case.source in SMALL:
+        of = source(case.source)
+        values, folder = of.values, of.folder
+    else:
+        path = EXAMPLES / case.source
+        values, folder = read_toml(path), path.parent
+    changed = {name: {**values.get(name, {}), **fields} for name, fields in case.changes.items()}
+    values = {**values, **changed}
+    if estimate:
+        values["output"] = {**values.get("output", {}), "error_frames": values["simulation"]["frames"]}
+    return scene_from(values, folder=folder)
+
+
+PARTS = {"fit": ("Fit", fit), "check": ("Check", check)}
+OPTIONS = {
+    "fitted": {"nargs": "+", "default": list(FITTED), "choices": FITTED, "help": "scenes of the fit"},
+    "checked": {"nargs": "+", "default": list(CHECKED), "choices": CHECKED, "help": "scenes of the check"},
+}
+DEVICES = None

@@ -1,0 +1,335 @@
+"""What a scene requires, in numbers: quickly estimated from its files, or counted from its particles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from pigjax import io
+from pigjax.core.errors import SceneError
+from pigjax.coupling.filling import lattice_step
+from pigjax.coupling.outliers import cut_outliers
+from pigjax.mls_mpm import SimConfig
+from pigjax.mpm import Particles, make_particles, vast_grid
+from pigjax.mpm.forces import Force
+from pigjax.mpm.materials import material_table
+from pigjax.mpm.timestep import substep_rule
+from pigjax.scene.advice import default_dx
+from pigjax.scene.arrangement import arrange
+from pigjax.scene.costs import Body, Required
+from pigjax.scene.forces import forces_of
+from pigjax.scene.plan import Inputs, Plan, gravity_of, read_inputs, segment
+from pigjax.scene.schema import Scene
+from pigjax.segmentation import Labels
+
+_VIEWS = 8  # photos whose masks are looked up
+_COARSE = 4  # mask pixels to one of the depth map of centres
+_BEHIND = 1.03  # times the nearest depth: centres farther away are hidden
+_VOXELS = 32  # along the longest side of an object
+_SAMPLE = 5_000  # Gaussians whose nearest neighbour is looked for
+_GAPS = 1.8  # distances to the third neighbour in a voxel: smaller ones leave holes in shells
+_SIDES = 5  # of the six sides, from which an inner voxel is hidden: what stands on a table is open below
+_ROOM, _AROUND, _UNIT = 1.3, 7, 4  # of the active grid, see `ActiveGrid`
+
+
+class Shape(NamedTuple):
+    """An object's Gaussians and the solid that they bound, on voxels."""
+
+    means: Float[np.ndarray, "n 3"]  # [m]
+    fullness: Float[np.ndarray, "x y z"]  # share of each voxel that is solid
+    origin: Float[np.ndarray, "3"]  # corner of the first voxel [m]
+    voxel: float  # [m]
+
+    @property
+    def volume(self) -> float:
+        """Of the solid [m³]."""
+        return float(self.fullness.sum()) * self.voxel**3
+
+    def particles(self, step: float, fill: bool) -> int:
+        """Gaussians, and lattice points inside whose cell of edge `step` [m] holds none."""
+        if not fill:
+            return len(self.means)
+        cells = np.unique(np.floor(self.means / step).astype(np.int64), axis=0)
+        place = np.floor(((cells + 0.5) * step - self.origin) / self.voxel).astype(int)
+        within = ((place >= 0) & (place < self.fullness.shape)).all(1)
+        taken = float(self.fullness[tuple(place[within].T)].sum())
+        return len(self.means) + max(round(self.volume / step**3 - taken), 0)
+
+
+@dataclass
+class Survey:
+    """A scene's files, read, with objects as far as they are known without the vote and the seeding."""
+
+    scene: Scene  # as `arrange` leaves it
+    inputs: Inputs
+    labels: Labels
+    shapes: dict[str, Shape]  # of the objects that move
+    voted: bool  # whether the run lets masks vote
+
+
+def survey(scene: Scene) -> Survey:
+    """Read a scene's files and look at its objects. Host; it takes the time of reading, and little more.
+
+    Where masks would vote, each Gaussian takes the id that most of eight photos have at its centre, if the centre is
+    not hidden there; Gaussians that none of them sees take that of their neighbour. The inside of an object are the
+    voxels, 32 along its longest side, that its Gaussians hide from five of six sides.
+
+    Args:
+        scene: as `load_scene` gives it.
+
+    Raises:
+        InputError: as `read_inputs` and `segment`.
+    """
+    inputs = read_inputs(scene)
+    asked = [name for name, e in scene.objects.items() if e.gaussians is None and e.within is None]
+    voted = inputs.stored is None and inputs.views is not None and inputs.labels is None and bool(asked)
+    labels = _quick_labels(scene, inputs) if voted else segment(scene, inputs)
+    scene, inputs, labels = arrange(scene, inputs, labels)
+    labels, _ = cut_outliers(
+        inputs.gaussians, labels, {inputs.ids[name]: entry.keep for name, entry in scene.objects.items()}
+    )
+    object_id, means = np.asarray(labels.object_id), np.asarray(inputs.gaussians.means, np.float64)
+    shapes = {name: shape_of(means[object_id == inputs.ids[name]]) for name, e in scene.objects.items() if not e.fixed}
+    return Survey(scene, inputs, labels, shapes, voted)
+
+
+def _quick_labels(scene: Scene, inputs: Inputs) -> Labels:
+    """Labels by centres in some masks; by the whole vote where an object would have no Gaussian by them."""
+    object_id = _ids_of_centres(inputs)
+    count = len(object_id)
+    guess = io.StoredLabels(object_id, np.zeros((count, 1)), np.ones(count), np.zeros(1, int))
+    try:
+        return segment(scene, replace(inputs, stored=guess))
+    except SceneError:
+        return segment(scene, inputs)
+
+
+def _ids_of_centres(inputs: Inputs) -> Int[np.ndarray, "n"]:
+    assert inputs.views is not None
+    views = inputs.views.voters
+    cameras, masks = views.cameras, views.masks
+    assert masks is not None
+    means = np.asarray(inputs.gaussians.means, np.float64)
+    ids = np.full((len(means), min(_VIEWS, len(masks))), -1, np.int64)
+    for column, view in enumerate(np.linspace(0, len(masks) - 1, ids.shape[1]).round().astype(int)):
+        camera, mask = cameras[int(view)], np.asarray(masks[view])
+        matrix = np.asarray(camera.world_to_cam, np.float64)
+        local = np.einsum("ij,nj->ni", matrix[:3, :3], means) + matrix[:3, 3]
+        depth = np.maximum(local[:, 2], 1e-9)
+        focal, centre = np.asarray(camera.focal, np.float64), np.asarray(camera.centre, np.float64)
+        pixel = np.floor(np.clip(local[:, :2] / depth[:, None] * focal + centre, -1, 1e6)).astype(int)
+        height, width = mask.shape
+        seen = (local[:, 2] > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
+        cell = (pixel[:, 1] // _COARSE) * (width // _COARSE + 1) + pixel[:, 0] // _COARSE
+        nearest = np.full((height // _COARSE + 1) * (width // _COARSE + 1), np.inf)
+        np.minimum.at(nearest, cell[seen], depth[seen])
+        seen[seen] = depth[seen] <= _BEHIND * nearest[cell[seen]]
+        ids[seen, column] = mask[pixel[seen, 1], pixel[seen, 0]]
+    return _most_named(ids, means)
+
+
+def _most_named(ids: Int[np.ndarray, "n v"], means: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
+    """The id that most columns have, -1 for none; rows without any take that of the nearest centre with one."""
+    best, most = np.full(len(ids), -1), np.zeros(len(ids), int)
+    for number in np.unique(ids[ids >= 0]):
+        count = (ids == number).sum(1)
+        best, most = np.where(count > most, number, best), np.maximum(most, count)
+    known = np.flatnonzero(best >= 0)
+    if 0 < len(known) < len(best):
+        unseen = np.flatnonzero(best < 0)
+        best[unseen] = best[known[cKDTree(means[known]).query(means[unseen])[1]]]
+    return best
+
+
+def shape_of(means: Float[np.ndarray, "n 3"]) -> Shape:
+    """The solid that centres of Gaussians bound, on voxels.
+
+    Voxels of the surface count by half. A sheet has no inside, and volume 0.
+
+    Args:
+        means: [m].
+    """
+    low, high = means.min(0), means.max(0)
+    some = means[:: max(len(means) // _SAMPLE, 1)]
+    gap = float(np.median(cKDTree(means).query(some, k=min(4, len(means)))[0][:, -1])) if len(means) > 3 else 0.0
+    voxel = max(float((high - low).max()) / _VOXELS, _GAPS * gap) or 1.0
+    place = np.floor((means - low) / voxel).astype(int) + 2
+    held = np.zeros(place.max(0) + 3, bool)
+    held[tuple(place.T)] = True
+    held = ndimage.binary_closing(held, np.ones((3, 3, 3), bool))
+    hidden = np.zeros(held.shape, np.int8)
+    for axis in range(3):
+        hidden += np.maximum.accumulate(held, axis)
+        hidden += np.flip(np.maximum.accumulate(np.flip(held, axis), axis), axis)
+    inner = ~held & (hidden >= _SIDES)
+    solid = ndimage.binary_closing(held | inner, np.ones((3, 3, 3), bool))
+    deep = ndimage.binary_erosion(solid)
+    fullness = np.where(deep, 1.0, np.where(solid, 0.5, 0.0)) if deep.any() else np.zeros(solid.shape)
+    return Shape(means, fullness, low - 2 * voxel, voxel)
+
+
+def required_by(survey: Survey, scene: Scene | None = None) -> Required:
+    """What a scene requires by its survey: the particles are estimated.
+
+    Args:
+        survey: of `survey`.
+        scene: the surveyed scene with other settings of `simulation`, `drawing` or `output`; by default its own.
+
+    Raises:
+        InputError: no step is stable.
+    """
+    scene = scene or survey.scene
+    spec, inputs = scene.simulation, survey.inputs
+    moving = {name: entry for name, entry in scene.objects.items() if not entry.fixed}
+    dx = spec.dx or default_dx(scene, inputs.gaussians, survey.labels, inputs.ids)
+    step = lattice_step(dx, spec.particles_per_cell)
+    table = material_table([entry.to_material(name) for name, entry in moving.items()])
+    bodies, corners = [], []
+    for (name, entry), law in zip(moving.items(), table.laws):
+        shape = survey.shapes[name]
+        ends = np.stack([shape.means.min(0), shape.means.max(0)])
+        size = shape.volume or float(np.prod(np.maximum(ends[1] - ends[0], 1e-9)))
+        bodies.append(Body(name, law, shape.particles(step, spec.fill), size ** (1 / 3) / dx))
+        spin = np.linalg.norm(entry.angular_velocity) * np.linalg.norm(ends[1] - ends[0]) / 2
+        fast = np.linalg.norm(entry.velocity) + spin
+        corners += [(ends[i, 0], ends[j, 1], ends[k, 2], fast) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    values = np.array(corners)
+    rows = np.repeat(np.arange(len(moving)), 8)
+    particles = make_particles(
+        jnp.asarray(values[:, :3], jnp.float32), volume=1.0, table=table, material=rows, body=rows,
+        velocity=values[:, 3:] * [0.0, 0.0, 1.0],
+    )  # fmt: skip
+    rule = substep_rule(
+        particles,
+        vast_grid(dx),
+        table,
+        SimConfig(kernel=spec.kernel, cfl=spec.cfl, integrator=spec.integrator),
+        frames=spec.frames,
+        frame_dt=1 / (spec.fps * spec.slow_motion),
+        gravity=gravity_of(scene),
+        colliders=scene.colliders(),
+        forces=_forces(scene, particles, list(moving)),
+    )
+    return _required(
+        scene, inputs, survey.labels, bodies, values[:, :3], dx,
+        substeps=rule.first, integrator=rule.config.integrator, voted=survey.voted, guessed=True,
+    )  # fmt: skip
+
+
+def drawn(needs: Required, scene: Scene) -> Required:
+    """The same matter with the pictures' size and threshold of another scene.
+
+    Args:
+        needs: of a scene.
+        scene: with another `drawing`.
+    """
+    spec = scene.drawing
+    return replace(needs, pixels=_pixels(scene), scale=spec.scale, alpha_min=spec.alpha_min)
+
+
+def _pixels(scene: Scene) -> int:
+    width, height = (max(round(side * scene.drawing.scale), 1) for side in (scene.camera.width, scene.camera.height))
+    return width * height
+
+
+def _forces(scene: Scene, particles: Particles, names: list[str]) -> tuple[Force, ...]:
+    """Those of the scene on the corners of its objects; none where they pick matter that corners do not show."""
+    try:
+        return forces_of(scene.forces, particles, {name: number for number, name in enumerate(names)})
+    except SceneError:
+        return ()
+
+
+def counted(scene: Scene, inputs: Inputs, plan: Plan, *, substeps: int, integrator: str, voted: bool) -> Required:
+    """What a scene requires, counted from its particles.
+
+    Args:
+        scene: of the run.
+        inputs: its files.
+        plan: of the scene.
+        substeps: of the first frame.
+        integrator: that was chosen.
+        voted: whether masks voted.
+    """
+    rows, volumes = np.asarray(plan.particles.material), np.asarray(plan.particles.volume0, np.float64)
+    names = [name for name, entry in scene.objects.items() if not entry.fixed]
+    size = np.bincount(rows, volumes, len(names)) ** (1 / 3)
+    bodies = [
+        Body(name, law, int(n), float(side) / plan.dx)
+        for name, law, n, side in zip(names, plan.table.laws, plan.particles.counts, size)
+    ]
+    return _required(
+        scene, inputs, plan.labels, bodies, np.asarray(plan.particles.x, np.float64), plan.dx,
+        substeps=substeps, integrator=integrator, voted=voted, guessed=False,
+    )  # fmt: skip
+
+
+def _required(
+    scene: Scene,
+    inputs: Inputs,
+    labels: Labels,
+    bodies: Iterable[Body],
+    x: Float[np.ndarray, "p 3"],
+    dx: float,
+    *,
+    substeps: int,
+    integrator: str,
+    voted: bool,
+    guessed: bool,
+) -> Required:
+    spec, drawing, views = scene.simulation, scene.drawing, inputs.views
+    bodies = tuple(bodies)
+    object_id = np.asarray(labels.object_id)
+    of_kind = {fixed: _members(object_id, inputs.ids, scene, fixed=fixed) for fixed in (False, True)}
+    sides = np.ceil((x.max(0) - x.min(0)) / dx) + _AROUND
+    nodes = math.prod(int(-(-side * _ROOM // _UNIT)) * _UNIT for side in sides)
+    total = inputs.gaussians.sh.shape[1]
+    drawn = total if drawing.sh_degree is None else min((drawing.sh_degree + 1) ** 2, total)
+    every, frames = scene.output.states_every, spec.frames
+    photos = 0 if views is None else len(views.names)
+    pixels = 0 if views is None or views.images is None else math.prod(views.images.shape[:3])
+    return Required(
+        bodies=bodies,
+        dx=dx,
+        nodes=nodes,
+        frames=frames,
+        substeps=substeps,
+        gaussians=len(inputs.gaussians),
+        moving=int(of_kind[False].sum()),
+        still=int(of_kind[True].sum()),
+        still_objects=sum(entry.fixed for entry in scene.objects.values()),
+        sh_coefficients=drawn,
+        colliders=len(scene.colliders()),
+        pixels=_pixels(scene),
+        photos=photos,
+        photo_pixels=pixels,
+        voted=voted,
+        contact=spec.contact_friction is not None and len(bodies) > 1,
+        forces=len(scene.forces),
+        integrator=integrator,
+        kernel=spec.kernel,
+        cfl=spec.cfl,
+        particles_per_cell=spec.particles_per_cell,
+        alpha_min=drawing.alpha_min,
+        scale=drawing.scale,
+        fewer_bands=drawn < total,
+        states=0 if not every else -(-(frames + 1) // every),
+        half_states=scene.output.compress_states,
+        error_frames=min(scene.output.error_frames, frames),
+        guessed=guessed,
+    )
+
+
+def _members(
+    object_id: Int[np.ndarray, "n"], ids: Mapping[str, int], scene: Scene, *, fixed: bool
+) -> Bool[np.ndarray, "n"]:
+    numbers = [ids[name] for name, entry in scene.objects.items() if entry.fixed == fixed]
+    return np.isin(object_id, numbers)

@@ -1,0 +1,42 @@
+"""The fit of prices recovers those that made the times, and leaves alone what no run needs."""
+
+import dataclasses
+
+import pytest
+from needs import NEEDS, scaled
+
+from benchmarks.plan import CHECKED, FITTED, Measured, fitted_prices, least_squares, scene_of
+from pigjax.scene import costs
+
+
+def test_the_fit_recovers_prices():
+    known = {"a": 1.0, "b": 1.0, "unused": 7.0}
+    amounts = [{"a": 1.0, "b": 10.0}, {"a": 5.0, "b": 1.0}, {"a": 2.0, "b": 40.0}] * 20
+    found = least_squares(known, amounts, [2 * x["a"] + 0.5 * x["b"] for x in amounts])
+    assert found["a"] == pytest.approx(2.0, rel=0.02)
+    assert found["b"] == pytest.approx(0.5, rel=0.02)
+    assert found["unused"] == 7.0
+
+
+def test_a_machine_of_half_the_speed_has_twice_the_prices():
+    true = costs.shipped_prices()
+    before = dataclasses.asdict(true)
+    runs = []
+    for factor, frames in ((1, 5), (2, 20), (8, 10), (30, 40)):
+        needs = dataclasses.replace(scaled(NEEDS, factor), frames=frames)
+        guess = costs.predict(needs, true)
+        doubled = ({k: 2 * v for k, v in part.items()} for part in (guess.run, guess.compile))
+        runs.append(Measured(needs, *doubled, guess.memory, {"step": 0.2}, None, None))
+    after = costs.prices_from(fitted_prices(before, runs))
+    for run in runs:
+        found = costs.predict(run.needs, after)
+        assert found.run_seconds == pytest.approx(sum(run.run.values()), rel=0.05)
+        assert found.compile_seconds == pytest.approx(sum(run.compile.values()), rel=0.05)
+        assert found.memory == pytest.approx(run.memory, rel=0.05)
+    assert after.probe == {"step": 0.2}
+
+
+def test_scenes_of_the_check_were_not_fitted_on():
+    assert len(CHECKED) >= 6
+    fitted = {repr(scene_of(case).simulation) + case.source for case in FITTED.values()}
+    assert not fitted & {repr(scene_of(case).simulation) + case.source for case in CHECKED.values()}
