@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from pigjax.core.arguments import checked
 from pigjax.core.errors import InputError
+from pigjax.core.gaussians import SH_CONSTANT
+from pigjax.core.harmonics import sh_basis
 
 _REACH = 1.3  # radius of a neighbourhood [cells]: 74 particles at two along each axis of a cell
 _MOST = 80  # neighbours that are asked for
@@ -17,6 +20,8 @@ _BALL = 0.15  # variance along an axis of a full ball with weights 1 - (d/r)³ [
 _RATIO = 4.0  # largest ratio of the lengths of a kernel, k_r of the paper
 _FEW = (6, 20)  # neighbours below which a kernel is a ball, and from which it is that of its neighbours
 _LAMBDA = 0.9  # share of the neighbours' mean in a smoothed centre, λ of the paper
+# a of the curve a (1 - c²) that is nearest to Schlick's (1 - c)^5 over all directions, in least squares
+SCHLICK = 135 / 448
 _SIDED = 0.15  # distance to the neighbours' mean from which a particle is at the surface [reaches]
 
 
@@ -88,7 +93,12 @@ def liquid_rest(x: Float[np.ndarray, "p 3"], *, dx: float) -> LiquidRest:
 
 @checked
 def smoothed(
-    x: Float[np.ndarray, "p 3"], F: Float[np.ndarray, "p 3 3"], rest: LiquidRest, *, dx: float
+    x: Float[np.ndarray, "p 3"],
+    F: Float[np.ndarray, "p 3 3"],
+    rest: LiquidRest,
+    *,
+    dx: float,
+    now: Kernels | None = None,
 ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3 3"]]:
     """Positions and deformations that pose the splats of a fluid on a smooth surface. Host.
 
@@ -103,13 +113,15 @@ def smoothed(
         F: their total deformation.
         rest: of the same particles.
         dx: grid spacing [m].
+        now: kernels of x, where they are known already.
 
     Raises:
         InputError: the rest state is of other particles.
     """
     if x.shape != rest.x.shape:
         raise InputError(f"smoothed: {len(x)} particles, but {len(rest.x)} at rest; give those of one fluid.")
-    now, before = liquid_kernels(np.asarray(x, np.float64), dx=dx), rest.kernels
+    before = rest.kernels
+    now = liquid_kernels(np.asarray(x, np.float64), dx=dx) if now is None else now
     u, _, vt = np.linalg.svd(np.where(np.isfinite(F).all((1, 2))[:, None, None], F, np.eye(3)).astype(np.float64))
     u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
     turn = np.einsum("pij,pjk->pik", u, vt)
@@ -121,6 +133,25 @@ def smoothed(
     shaped = np.einsum("pij,pjk,pkl->pil", now.shapes, np.linalg.inv(old), turn)
     shift = now.centres - x - np.einsum("pij,pj->pi", turn, before.centres - rest.x)
     return (x + shift).astype(x.dtype), shaped.astype(F.dtype)
+
+
+def sheen(normals: Float[np.ndarray, "m 3"], strength: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m 9"]:
+    """Coefficients of spherical harmonics of a reflection that brightens where a surface is seen at a low angle. Host.
+
+    Schlick (1994): the reflected share beyond that at normal incidence is (1 - c)^5 with the cosine c of the angle
+    between view and normal. Degree 2 holds of it what leaves the colour seen along the normal: 135/448 (1 - c²).
+
+        sh[:, :9] += sheen(kernels.normals, 0.8 * kernels.sided)[..., None] * (1 - colour)[:, None, :]
+
+    Args:
+        normals: unit normals; their sign does not count.
+        strength: factor of each.
+    """
+    bands = np.asarray(sh_basis(jnp.asarray(normals), 2), np.float64)
+    # 1 - c² = 2/3 (1 - P2(c)), and the addition theorem writes P2(c) as 4 pi / 5 times a sum of products
+    bands[:, 4:] *= -2 / 3 * 4 * np.pi / 5
+    bands[:, 0], bands[:, 1:4] = 2 / 3 / SH_CONSTANT, 0
+    return SCHLICK * np.asarray(strength)[:, None] * bands
 
 
 def _smallest_turn(a: Float[np.ndarray, "p 3"], b: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3 3"]:

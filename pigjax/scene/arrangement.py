@@ -37,7 +37,7 @@ def arrange(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs
     scene, inputs, labels = _without_removed(scene, inputs, labels)
     total = inputs.gaussians.sh.shape[1]
     total = max([total, *(own.sh.shape[1] for own in inputs.own.values())])
-    base, parts = _with_bands(inputs.gaussians, total), []
+    base, parts = with_bands(inputs.gaussians, total), []
     objects, ids, owners = dict(scene.objects), dict(inputs.ids), []
     free = max([*ids.values(), *np.unique(np.asarray(labels.object_id)).tolist(), *inputs.names, 0])
     object_id = np.asarray(labels.object_id)
@@ -46,7 +46,7 @@ def arrange(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs
             continue
         members = np.flatnonzero(object_id == ids[name])
         own = inputs.own.get(name)
-        source = jax.tree.map(lambda v, m=members: v[m], base) if own is None else _with_bands(own, total)
+        source = jax.tree.map(lambda v, m=members: v[m], base) if own is None else with_bands(own, total)
         here = placed(source, placement(source, entry, joined("objects", name)))
         objects[name] = with_fields(entry, copies=[])
         if own is None:
@@ -101,7 +101,7 @@ def placement(gaussians: Gaussians, entry: ObjectSpec, name: str) -> Float[np.nd
     return matrix
 
 
-def _with_bands(gaussians: Gaussians, count: int) -> Gaussians:
+def with_bands(gaussians: Gaussians, count: int) -> Gaussians:
     """The same colours with more coefficients of spherical harmonics, which are zero."""
     more = count - gaussians.sh.shape[1]
     return gaussians if more == 0 else replace(gaussians, sh=jnp.pad(gaussians.sh, ((0, 0), (0, more), (0, 0))))

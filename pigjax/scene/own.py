@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -13,11 +13,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from pigjax import io
+from pigjax.core.gaussians import SH_CONSTANT
 from pigjax.coupling.binding import bind
-from pigjax.coupling.liquid import LiquidRest, liquid_rest, smoothed
+from pigjax.coupling.liquid import Kernels, LiquidRest, liquid_kernels, liquid_rest, sheen, smoothed
 from pigjax.coupling.own_splats import OwnSplats, make_own_splats
 from pigjax.mpm import Particles
-from pigjax.scene.arrangement import appended
+from pigjax.scene.arrangement import appended, with_bands
 from pigjax.scene.plan import Inputs, Plan
 from pigjax.scene.schema import Scene
 from pigjax.scene.world import axis_of
@@ -30,18 +31,47 @@ MADE = "own_splats"  # prefix of the arrays in the file of the rest state that a
 
 
 @dataclass
-class Liquids:
-    """Fluids whose splats are shaped by their neighbours: the rows of each, and its surface at rest."""
+class Liquid:
+    """A fluid whose splats are shaped by their neighbours."""
 
-    parts: list[tuple[Int[np.ndarray, "p"], LiquidRest]]
+    rows: Int[np.ndarray, "p"]  # its particles
+    rest: LiquidRest
+    sheen: float  # 0 to 1
+    splats: Int[np.ndarray, "m"]  # its Gaussians
+    at: Int[np.ndarray, "m"]  # place of the carrier of each in `rows`
+
+
+@dataclass
+class Liquids:
+    """The fluids of a scene that are drawn with a smooth surface."""
+
+    parts: list[Liquid]
     dx: float  # [m]
 
-    def __call__(self, particles: Particles) -> Particles:
-        """Particles whose positions and deformations pose smooth surfaces. Host."""
+    def __call__(self, gaussians: Gaussians, particles: Particles) -> tuple[Gaussians, Particles]:
+        """Gaussians with their sheen, and particles whose positions and deformations pose smooth surfaces. Host."""
         x, F = np.array(particles.x), np.array(particles.F_visual)
-        for rows, rest in self.parts:
-            x[rows], F[rows] = smoothed(x[rows], F[rows], rest, dx=self.dx)
-        return eqx.tree_at(lambda p: (p.x, p.F_visual), particles, (jnp.asarray(x), jnp.asarray(F)))
+        sh = np.array(gaussians.sh) if any(part.sheen for part in self.parts) else None
+        for part in self.parts:
+            here, now = x[part.rows], liquid_kernels(x[part.rows].astype(np.float64), dx=self.dx)
+            x[part.rows], F[part.rows] = smoothed(here, F[part.rows], part.rest, dx=self.dx, now=now)
+            if sh is not None and part.sheen:
+                sh[part.splats] = _shining(sh[part.splats], F[part.rows], now, part)
+        particles = eqx.tree_at(lambda p: (p.x, p.F_visual), particles, (jnp.asarray(x), jnp.asarray(F)))
+        return gaussians if sh is None else replace(gaussians, sh=jnp.asarray(sh)), particles
+
+
+def _shining(
+    sh: Float[np.ndarray, "m k 3"], F: Float[np.ndarray, "p 3 3"], now: Kernels, part: Liquid
+) -> Float[np.ndarray, "m k 3"]:
+    """Colours with a sheen about the surface as it is now, in the rest frame of each splat, which F turns."""
+    u, _, vt = np.linalg.svd(np.where(np.isfinite(F).all((1, 2))[:, None, None], F, np.eye(3)).astype(np.float64))
+    normals = np.einsum("pij,pjk,pk->pi", vt.swapaxes(1, 2), u.swapaxes(1, 2), now.normals)
+    colour = np.clip(sh[:, 0] * SH_CONSTANT + 0.5, 0, 1)
+    added = sheen(normals, part.sheen * now.sided)[part.at]
+    shining = sh.copy()
+    shining[:, :9] += (added[..., None] * (1 - colour)[:, None]).astype(sh.dtype)
+    return shining
 
 
 def chosen(scene: Scene, laws: Mapping[str, str], torn: Callable[[str], bool]) -> list[str]:
@@ -132,8 +162,11 @@ def with_own(
     particles = replace(plan.particles, gaussian=jnp.asarray(place[np.asarray(plan.particles.gaussian)], jnp.int32))
     binding = bind(everything, labels, particles, carrier=carrier, dx=plan.dx)
     laws = laws_of(scene, plan)
-    smooth = [inputs.ids[n] for n in names if scene.objects[n].surface == "smooth" and laws[n] == "fluid"]
-    arrays |= {"carrier": carrier, "smooth": np.asarray(smooth, int)}
+    smooth = [n for n in names if scene.objects[n].surface == "smooth" and laws[n] == "fluid"]
+    sheens = [scene.objects[name].sheen for name in smooth]
+    if any(sheens):
+        everything = with_bands(everything, max(9, everything.sh.shape[1]))
+    arrays |= {"carrier": carrier, "smooth": np.asarray([inputs.ids[name] for name in smooth], int), "sheen": np.asarray(sheens, float)}
     inputs = replace(inputs, gaussians=everything, arranged=True)
     return inputs, replace(plan, particles=particles, labels=labels, binding=binding), arrays
 
@@ -161,15 +194,31 @@ def _stored(arrays: Mapping[str, np.ndarray], prefix: str, mark: str) -> OwnSpla
 
 
 def liquids_of(
-    smooth: Sequence[int], objects: Int[np.ndarray, "p"], x: Float[Array, "p 3"], dx: float
+    smooth: Mapping[int, float],
+    objects: Int[np.ndarray, "p"],
+    x: Float[Array, "p 3"],
+    carrier: Int[np.ndarray, "n"],
+    dx: float,
 ) -> Liquids | None:
     """Surfaces at rest of the fluids that are drawn smooth; None where there are none. Host.
 
     Args:
-        smooth: ids of these fluids.
+        smooth: sheen of each of these fluids, by its id.
         objects: id of each particle's object.
         x: particles at rest [m].
+        carrier: particle of each Gaussian, -1 for those that were not made for their matter.
         dx: grid spacing [m].
     """
-    rows = [np.flatnonzero(objects == number) for number in smooth]
-    return Liquids([(own, liquid_rest(np.asarray(x)[own], dx=dx)) for own in rows], dx) if rows else None
+    parts = []
+    for number, strength in smooth.items():
+        rows = np.flatnonzero(objects == number)
+        splats = np.flatnonzero(np.isin(carrier, rows))
+        rest = liquid_rest(np.asarray(x)[rows], dx=dx)
+        parts.append(Liquid(rows, rest, strength, splats, np.searchsorted(rows, carrier[splats])))
+    return Liquids(parts, dx) if parts else None
+
+
+def smooth_of(arrays: Mapping[str, np.ndarray]) -> dict[int, float]:
+    """Sheen of each fluid that is drawn smooth, by its id, from the arrays of `with_own`."""
+    ids = arrays.get("smooth", np.zeros(0, int))
+    return dict(zip(np.asarray(ids).tolist(), np.asarray(arrays.get("sheen", np.zeros(len(ids)))).tolist()))

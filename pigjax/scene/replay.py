@@ -22,7 +22,7 @@ from pigjax.core.placing import similarity
 from pigjax.coupling.binding import Binding, bind, deform
 from pigjax.mpm import Particles
 from pigjax.mpm.colliders import Collider, SampledDistance
-from pigjax.scene.own import Liquids, liquids_of
+from pigjax.scene.own import Liquids, liquids_of, smooth_of
 from pigjax.scene.plan import Inputs, clamp_params, make_cameras, read_gaussians, read_inputs
 from pigjax.scene.schema import Scene, load_scene
 from pigjax.scene.world import axis_of
@@ -103,7 +103,7 @@ class Run:
     mode: str = "aligned"  # of the clamp
     # particle of each Gaussian that was made for its matter, -1 for the others; None: there are none
     carrier: Int[np.ndarray, "n"] | None = field(default=None, repr=False)
-    smooth: tuple[int, ...] = ()  # ids of fluids that are drawn with a smooth surface
+    smooth: dict[int, float] = field(default_factory=dict)  # sheen of fluids with a smooth surface, by id
 
     @property
     def to_capture(self) -> Float[np.ndarray, "4 4"]:
@@ -153,14 +153,17 @@ class Run:
         Raises:
             MissingFileError: the frame has no state.
         """
-        particles = self.particles(frame)
-        particles = particles if self.liquids is None else self.liquids(particles)
-        return _pose(self.gaussians, particles, self.clamp, self.binding, self.mode)
+        gaussians, particles = self.gaussians, self.particles(frame)
+        if self.liquids is not None:
+            gaussians, particles = self.liquids(gaussians, particles)
+        return _pose(gaussians, particles, self.clamp, self.binding, self.mode)
 
     @cached_property
     def liquids(self) -> Liquids | None:
         """Fluids that are drawn with a smooth surface."""
-        return liquids_of(self.smooth, self.rows["object"], self.rest.x, self.dx)
+        if self.carrier is None:
+            return None
+        return liquids_of(self.smooth, self.rows["object"], self.rest.x, self.carrier, self.dx)
 
     @cached_property
     def moving(self) -> np.ndarray:
@@ -254,7 +257,7 @@ def load_run(folder: str | os.PathLike[str], *, scene: Scene | None = None) -> R
         clamp=clamp_params(scene.clamp),
         mode=scene.clamp.mode,
         carrier=stored.get("carrier"),
-        smooth=tuple(stored.get("smooth", np.zeros(0, int)).tolist()),
+        smooth=smooth_of(stored),
     )
 
 

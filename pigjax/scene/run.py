@@ -30,7 +30,7 @@ from pigjax.scene.arrangement import arrange
 from pigjax.scene.budget import ScenePlan, refined
 from pigjax.scene.costs import Comparison, Pace, Prediction, predict
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
-from pigjax.scene.own import MADE, Liquids, chosen, is_torn, laws_of, liquids_of, with_own
+from pigjax.scene.own import MADE, Liquids, chosen, is_torn, laws_of, liquids_of, smooth_of, with_own
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
 from pigjax.scene.replay import COLLIDER_FILE, REST_FILE, SCENE_FILE, rows_of, store_colliders, store_rest
 from pigjax.scene.report import RunReport
@@ -165,7 +165,7 @@ def _run(
             if names:
                 rows["gaussian"] = np.asarray(drawn.particles.gaussian)
                 _store(scene, seen, drawn, rows, out, key, own)
-                liquids = liquids_of(own["smooth"].tolist(), rows["object"], plan.particles.x, plan.dx)
+                liquids = liquids_of(smooth_of(own), rows["object"], plan.particles.x, own["carrier"], plan.dx)
                 report.sizes["own_splats_of"] = {
                     name: int(np.sum(np.asarray(drawn.labels.object_id) == inputs.ids[name])) for name in names
                 }
@@ -424,8 +424,8 @@ def _draw(
     def draw(frame: int) -> tuple[jax.Array, jax.Array]:
         state = io.load_state(out / "states", frame, signature=key)
         particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, (state["x"], state["F_visual"]))
-        particles = particles if liquids is None else liquids(particles)
-        return pose_and_render(gaussians, particles, plan.binding, cameras[frame])
+        shown, particles = (gaussians, particles) if liquids is None else liquids(gaussians, particles)
+        return pose_and_render(shown, particles, plan.binding, cameras[frame])
 
     sheet_frames = np.unique(np.linspace(0, frames, _SHEET_FRAMES).round().astype(int))
     sheet: list[np.ndarray] = []

@@ -27,7 +27,7 @@ from pigjax.scene.world import WorldSpec, axis_of, metres_of
 from pigjax.splatting.types import RenderConfig
 
 Triple = tuple[float, float, float]
-_OF_OWN_SPLATS = {"inside": None, "surface": "particles", "transparency": 0.0}
+_OF_OWN_SPLATS = {"inside": None, "surface": "particles", "transparency": 0.0, "sheen": 0.0}
 OF_DRAWING = ("splats", *_OF_OWN_SPLATS)  # fields of an object on which no simulated state depends
 _NUMBERS = tuple(number.name for number in fields(Parameters))
 _PLACE = Limits(-1e9, 1e9, unit="m")
@@ -189,6 +189,7 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     # of a fluid with own splats: "smooth" shapes them by their neighbours, so that a pool is flat and a drop round
     surface: Literal["particles", "smooth"] = "particles"
     transparency: Annotated[float, Limits(0, 1)] = 0.0  # of own splats: 0 as in the capture, 1 not there
+    sheen: Annotated[float, Limits(0, 1)] = 0.0  # of a smooth surface: brighter where it is seen at a low angle
     start: Annotated[float, Limits(0, 1e6, unit="s")] = 0.0  # simulated time until which it stands still, as a rock
     density: Annotated[float, Limits(unit="kg/m³")] | None = None
     young: Annotated[float, Limits(unit="Pa")] | None = None
@@ -225,6 +226,8 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
         for name, still in _OF_OWN_SPLATS.items():
             rule = f'it belongs to splats of its own; give splats = "own" or "auto", or remove {name}'
             yield name, self.splats != "carried" or getattr(self, name) == still, rule
+        smooth = self.surface == "smooth"
+        yield "sheen", smooth or not self.sheen, 'it needs the normals of a smooth surface; give surface = "smooth"'
         both = self.gaussians is not None and (self.within is not None or self.id is not None)
         yield "gaussians", not both, "a file of its own needs no id and no region; remove one of the two"
 
