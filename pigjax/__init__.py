@@ -18,6 +18,7 @@ from pigjax.coupling.outliers import cut_outliers
 from pigjax.coupling.own_splats import OwnSplats, make_own_splats
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
+from pigjax.coupling.vessel import vessel_from_gaussians
 from pigjax.io import (
     Views,
     load_dataset,
@@ -182,4 +183,5 @@ __all__ = [
     "tune_study",
     "vast_grid",
     "write_video",
+    "vessel_from_gaussians",
 ]

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from pigjax.core.arguments import checked
 from pigjax.core.errors import InputError
 from pigjax.core.gaussians import SH_CONSTANT
 from pigjax.core.harmonics import sh_basis
+from pigjax.splat import Gaussians
 
 _REACH = 1.3  # radius of a neighbourhood [cells]: 74 particles at two along each axis of a cell
 _MOST = 80  # neighbours that are asked for
@@ -133,6 +136,24 @@ def smoothed(
     shaped = np.einsum("pij,pjk,pkl->pil", now.shapes, np.linalg.inv(old), turn)
     shift = now.centres - x - np.einsum("pij,pj->pi", turn, before.centres - rest.x)
     return (x + shift).astype(x.dtype), shaped.astype(F.dtype)
+
+
+def with_kernels(gaussians: Gaussians, kernels: Kernels) -> Gaussians:
+    """Round splats of particles with centres and shapes of their kernels. Host.
+
+    Args:
+        gaussians: one for each particle.
+        kernels: of the particles.
+    """
+    lengths, axes = np.linalg.eigh(kernels.shapes)
+    axes[:, :, 0] *= np.linalg.det(axes)[:, None]
+    kind = gaussians.means.dtype
+    return replace(
+        gaussians,
+        means=jnp.asarray(kernels.centres, kind),
+        log_scales=gaussians.log_scales + jnp.asarray(np.log(np.maximum(lengths, 1e-3)), kind),
+        quats=jnp.asarray(Rotation.from_matrix(axes).as_quat(scalar_first=True), kind),
+    )
 
 
 def sheen(normals: Float[np.ndarray, "m 3"], strength: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m 9"]:

@@ -15,12 +15,12 @@ from jaxtyping import Array, Float, Int
 from pigjax import io
 from pigjax.core.gaussians import SH_CONSTANT
 from pigjax.coupling.binding import bind
-from pigjax.coupling.liquid import Kernels, LiquidRest, liquid_kernels, liquid_rest, sheen, smoothed
+from pigjax.coupling.liquid import Kernels, LiquidRest, liquid_kernels, liquid_rest, sheen, smoothed, with_kernels
 from pigjax.coupling.own_splats import OwnSplats, make_own_splats
 from pigjax.mpm import Particles
 from pigjax.scene.arrangement import appended, with_bands
 from pigjax.scene.plan import Inputs, Plan
-from pigjax.scene.schema import Scene
+from pigjax.scene.schema import Scene, VolumeSpec
 from pigjax.scene.world import axis_of
 from pigjax.splat import Gaussians
 
@@ -136,6 +136,10 @@ def with_own(
     for number, name in enumerate(names):
         entry = scene.objects[name]
         rows = np.flatnonzero(body == moving.index(name))
+        if isinstance(entry, VolumeSpec):
+            made = _of_volume(inputs.gaussians, plan, rows, entry.surface == "smooth")
+            parts.append((_fainter(made, entry.transparency), rows))
+            continue
         members = np.flatnonzero(object_id == inputs.ids[name])
         mine = jax.tree.map(lambda values, members=members: values[members], inputs.gaussians)
         mark = io.digest(mine, x[rows], plan.dx, entry.inside, make_own_splats)
@@ -166,9 +170,23 @@ def with_own(
     sheens = [scene.objects[name].sheen for name in smooth]
     if any(sheens):
         everything = with_bands(everything, max(9, everything.sh.shape[1]))
-    arrays |= {"carrier": carrier, "smooth": np.asarray([inputs.ids[name] for name in smooth], int), "sheen": np.asarray(sheens, float)}
+    arrays |= {
+        "carrier": carrier,
+        "smooth": np.asarray([inputs.ids[name] for name in smooth], int),
+        "sheen": np.asarray(sheens, float),
+    }
     inputs = replace(inputs, gaussians=everything, arranged=True)
     return inputs, replace(plan, particles=particles, labels=labels, binding=binding), arrays
+
+
+def _of_volume(gaussians: Gaussians, plan: Plan, rows: Int[np.ndarray, "p"], smooth: bool) -> Gaussians:
+    """Splats of matter that was poured: those that its particles have, on a smooth surface where it is a fluid."""
+    carried = np.asarray(plan.particles.gaussian)[rows]
+    mine = jax.tree.map(lambda values: values[carried], gaussians)
+    law = plan.table.laws[int(np.asarray(plan.particles.body)[rows[0]])]
+    if not (smooth and law == "fluid"):
+        return mine
+    return with_kernels(mine, liquid_kernels(np.asarray(plan.particles.x, np.float64)[rows], dx=plan.dx))
 
 
 def _fainter(gaussians: Gaussians, transparency: float) -> Gaussians:

@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pigjax import InputError
-from pigjax.coupling.liquid import liquid_kernels, liquid_rest, smoothed
+from pigjax.core.harmonics import sh_basis
+from pigjax.coupling.liquid import SCHLICK, liquid_kernels, liquid_rest, sheen, smoothed
 
 DX = 0.02
 
@@ -88,6 +89,21 @@ def test_lost_particles_do_not_spoil_the_others():
     assert np.isfinite(there[good]).all()
     assert np.isfinite(turned[good]).all()
     assert np.isnan(there[3]).all()
+
+
+def test_sheen_is_the_part_of_schlicks_curve_that_leaves_the_colour_along_the_normal():
+    c, w = np.polynomial.legendre.leggauss(40)
+    c, w = (c + 1) / 2, w / 2  # both signs of c give the same
+    curve, span = (1 - c) ** 5, 1 - c**2
+    nearest = (w * curve * span).sum() / (w * span**2).sum()
+    assert nearest == pytest.approx(SCHLICK, rel=1e-12)
+    rng = np.random.default_rng(1)
+    normals, d = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in rng.normal(size=(2, 200, 3)))
+    strength = rng.uniform(size=200)
+    seen = np.einsum("nk,nk->n", np.asarray(sh_basis(d, 2)), sheen(normals, strength))
+    np.testing.assert_allclose(seen, strength * nearest * (1 - (normals * d).sum(1) ** 2), atol=1e-6)
+    np.testing.assert_allclose(sheen(-normals, strength), sheen(normals, strength), atol=1e-7)
+    assert not sheen(normals, 0 * strength).any()
 
 
 def test_wrong_arguments_are_named():

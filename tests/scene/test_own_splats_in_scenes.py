@@ -10,6 +10,9 @@ from scenes import ball, values
 from pigjax import io
 from pigjax.core.camera import orbit
 from pigjax.core.errors import SceneError
+from pigjax.core.gaussians import SH_CONSTANT
+from pigjax.core.harmonics import sh_basis
+from pigjax.coupling.liquid import SCHLICK
 from pigjax.coupling.own_splats import make_own_splats
 from pigjax.scene import export_run, load_run, run_scene, scene_from
 from pigjax.scene import own as module
@@ -106,6 +109,28 @@ def test_objects_that_are_carried_keep_their_splats_beside_own_ones(tmp_path):
     np.testing.assert_allclose(run.splats(0).means, run.gaussians.means, atol=1e-5)
 
 
+def test_sheen_brightens_a_surface_seen_at_a_low_angle(folder, tmp_path):
+    run_scene(scene(folder, splats="own", surface="smooth", inside=[0.0, 0.2, 0.6], sheen=0.8), tmp_path)
+    run = load_run(tmp_path)
+    assert run.smooth == {1: 0.8}
+    still, moved = run.gaussians, run.splats(1)
+    assert still.sh.shape[1] == 9
+    assert not np.asarray(still.sh)[:, 1:].any()  # at rest in the file there is none: it follows the surface
+    (liquid,) = run.liquids.parts
+    kernels = liquid.rest.kernels
+    top = int(np.argmax(kernels.sided * kernels.normals[:, 2]))
+    (mine,) = np.nonzero(liquid.at == top)
+    axis = kernels.normals[top] / np.linalg.norm(kernels.normals[top])
+    side = np.cross(axis, [1.0, 0.0, 0.0])
+    directions = jnp.asarray(np.stack([axis, side / np.linalg.norm(side)]), jnp.float32)
+    shone, _ = run.liquids(run.gaussians, run.particles(0))
+    colours = np.einsum("dk,kc->dc", np.asarray(sh_basis(directions, 2)), np.asarray(shone.sh)[mine[0]]) + 0.5
+    base = np.asarray(still.sh)[mine[0], 0] * SH_CONSTANT + 0.5
+    np.testing.assert_allclose(colours[0], base, atol=1e-5)
+    np.testing.assert_allclose(colours[1] - base, 0.8 * SCHLICK * kernels.sided[top] * (1 - base), atol=1e-5)
+    assert moved.sh_rotations is not None
+
+
 def test_auto_goes_by_law_and_by_stretch(folder):
     of = partial(chosen, scene(folder, splats="auto"))
     assert of({"ball": "fluid"}, torn=lambda name: False) == ["ball"]
@@ -127,6 +152,8 @@ def test_auto_goes_by_law_and_by_stretch(folder):
         ({"inside": [0.5, 0.5, 0.5]}, "splats of its own"),
         ({"surface": "smooth"}, "splats of its own"),
         ({"splats": "own", "transparency": 1.5}, "transparency"),
+        ({"splats": "own", "sheen": 0.5}, "smooth surface"),
+        ({"sheen": 0.5, "surface": "smooth"}, "splats of its own"),
         ({"splats": "own", "fixed": True, "material": None, "bulk_modulus": None}, "fixed object"),
     ],
 )
