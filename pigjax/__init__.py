@@ -182,6 +182,6 @@ __all__ = [
     "sweep_study",
     "tune_study",
     "vast_grid",
-    "write_video",
     "vessel_from_gaussians",
+    "write_video",
 ]

@@ -78,9 +78,9 @@ def test_box_points_lie_at_the_centres_of_cells():
 
 
 def test_what_holds_no_water_is_named():
-    with pytest.raises(InputError, match="mug: .*hollow"):
+    with pytest.raises(InputError, match=r"mug: .*hollow"):
         vessel_from_gaussians(cup(), spacing=0.02, name="mug")  # walls as thick as the cup
     with pytest.raises(InputError, match="spacing = 0"):
         vessel_from_gaussians(cup(), spacing=0.0)
-    with pytest.raises(InputError, match="wall = 0.001"):
+    with pytest.raises(InputError, match=r"wall = 0\.001"):
         vessel_from_gaussians(cup(), spacing=STEP, wall=0.001)
