@@ -64,20 +64,20 @@ def vessel_from_gaussians(
         raise InputError(f"{name}: wall = {wall} m: must be two samples of {spacing:.3g} m or more.")
     frame = _upright(up)
     shell = shell_of(jax.tree.map(np.asarray, gaussians), name=name)
-    points = surface_samples(shell, spacing) @ frame.T
+    points = np.dot(surface_samples(shell, spacing), frame.T)
     gap = max(_CLOSED, int(np.ceil(_GAP * shell.spacing / spacing)))
     low = points.min(0) - (_MARGIN + gap) * spacing
     place = np.floor((points - low) / spacing).astype(int)
     taken = np.zeros(place.max(0) + _MARGIN + gap + 1, bool)
     taken[tuple(place.T)] = True
-    distance = spacing * _hollowed(taken, gap, wall / spacing)
+    distance = spacing * _hollowed(taken, gap, wall / spacing, name)
     # back to the axes of the world
     ends = np.array([low, low + spacing * np.array(taken.shape)])
-    corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), -1).reshape(-1, 3) @ frame
+    corners = np.dot(np.stack(np.meshgrid(*ends.T, indexing="ij"), -1).reshape(-1, 3), frame)
     origin = corners.min(0)
     shape = np.ceil(np.ptp(corners, axis=0) / spacing).astype(int) + 1
     lattice = origin + spacing * np.moveaxis(np.indices(shape), 0, -1)
-    at = np.moveaxis((lattice @ frame.T - low) / spacing - 0.5, -1, 0)
+    at = np.moveaxis((np.dot(lattice, frame.T) - low) / spacing - 0.5, -1, 0)
     samples = ndimage.map_coordinates(distance, at, order=1, mode="nearest")
     numbers = (jnp.asarray(v, jnp.result_type(float)) for v in (samples, origin, spacing, friction))
     return SampledDistance(**dict(zip(("samples", "origin", "dx", "friction"), numbers)), mode=mode)
@@ -89,18 +89,25 @@ def _upright(up: Any) -> Float[np.ndarray, "3 3"]:
     return np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], [axis])[0].as_matrix()) if axis[2] < 1 else np.eye(3)
 
 
-def _hollowed(taken: Bool[np.ndarray, "x y z"], gap: int, wall: float) -> Float[np.ndarray, "x y z"]:
+def _hollowed(taken: Bool[np.ndarray, "x y z"], gap: int, wall: float, name: str) -> Float[np.ndarray, "x y z"]:
     """Distance from the walls and the floor of a vessel [voxels], z up, from the voxels of its surface.
 
     Args:
         taken: voxels of the surface.
         gap: half of the widest gap in it that is closed [voxels].
         wall: thickness [voxels].
+        name: of the object, for messages.
+
+    Raises:
+        InputError: there is no inside.
     """
     filled = np.zeros(taken.shape, bool)
     disc = np.hypot(*np.mgrid[-gap : gap + 1, -gap : gap + 1]) <= gap
+    taken = ndimage.binary_closing(taken, np.ones((1, 1, 2 * gap + 1), bool))
     for k in range(taken.shape[2]):
-        filled[:, :, k] = ndimage.binary_fill_holes(ndimage.binary_closing(taken[:, :, k], disc))
+        # the outline is widened until it is closed, filled, and narrowed again
+        whole = ndimage.binary_fill_holes(ndimage.binary_dilation(taken[:, :, k], disc))
+        filled[:, :, k] = ndimage.binary_erosion(whole, disc)
     part, _ = ndimage.label(filled)
     filled = part == 1 + np.argmax(np.bincount(part.ravel())[1:])
     area = filled.sum((0, 1))
@@ -114,6 +121,8 @@ def _hollowed(taken: Bool[np.ndarray, "x y z"], gap: int, wall: float) -> Float[
     height = np.arange(taken.shape[2])
     outer = np.maximum(outline, np.maximum(wide[0] - 0.5 - height, height - wide[-1] - 0.5))
     inner = np.maximum(outline + wall, wide[0] - 0.5 + wall - height)
+    if not ((inner < 0) & (outer < 0)).any():
+        raise InputError(f"{name}: its walls leave no inside; take a finer simulation.dx, or remove hollow.")
     return np.maximum(outer, -inner)
 
 
@@ -142,7 +151,7 @@ def points_in_vessel(
     inside = ndimage.map_coordinates(ndimage.binary_dilation(held).astype(np.uint8), place.T, order=0) > 0
     # some of a lattice cell from the wall: a particle has a size
     clear = ndimage.map_coordinates(samples, place.T, order=1, mode="nearest") > CLEAR * step
-    return points[inside & clear & (points @ axis <= floor + level * (rim - floor))], cell
+    return points[inside & clear & (np.dot(points, axis) <= floor + level * (rim - floor))], cell
 
 
 def box_points(
@@ -172,7 +181,7 @@ def _inside(
     Raises:
         InputError: there are no such samples.
     """
-    height = lattice @ (up / np.linalg.norm(up))
+    height = np.dot(lattice, up / np.linalg.norm(up))
     step = float(np.linalg.norm(lattice[1, 1, 1] - lattice[0, 0, 0])) / np.sqrt(3)
     best, most, rim = np.zeros(free.shape, bool), 0, 0.0
     border = np.ones(free.shape, bool)

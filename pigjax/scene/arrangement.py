@@ -165,7 +165,7 @@ def points_of(
     assert entry.radius is not None
     points, cell = box_points(ends.min(0) - entry.radius, ends.max(0) + entry.radius, step)
     axis = ends[1] - ends[0]
-    along = ((points - ends[0]) @ axis) / max(axis @ axis, 1e-30)
+    along = np.dot(points - ends[0], axis) / max(np.dot(axis, axis), 1e-30)
     gap = np.linalg.norm(points - ends[0] - along[:, None] * axis, axis=1)
     return points[(gap <= entry.radius) & (along >= 0) & (along <= 1)], cell
 

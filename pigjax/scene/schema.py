@@ -271,19 +271,11 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
 
 _SHAPES = {"a box": ("lower", "upper"), "a ball": ("centre", "radius"), "a cylinder": ("bottom", "top", "radius")}
 _FILLED = {"a vessel": ("fills",), **_SHAPES}
-_CAPTURED = (
-    "id",
-    "gaussians",
-    "within",
-    "height",
-    "offset",
-    "rotation",
-    "scale",
-    "copies",
-    "removed",
-    "fixed",
-    "hollow",
-)
+
+# fields of an object that a volume has not
+_OF_CAPTURED = (
+    "id", "gaussians", "within", "height", "offset", "rotation", "scale", "copies", "removed", "fixed", "hollow",
+)  # fmt: skip
 
 
 class VolumeSpec(ObjectSpec, frozen=True, kw_only=True):

@@ -10,12 +10,10 @@ from pigjax.coupling.vessel import box_points, points_in_vessel, vessel_from_gau
 RADIUS, HEIGHT, STEP = 0.04, 0.1, 0.004
 
 
-def cup(turn=None, *, closed=True):
-    """Flat Gaussians on a cylinder of radius 4 cm and height 10 cm with a floor, open above, and a messy inside."""
+def cup(turn=None):
+    """Gaussians on the side of a cylinder of radius 4 cm and height 10 cm, and a messy inside."""
     around, up = np.meshgrid(np.linspace(0, 2 * np.pi, 48, endpoint=False), np.linspace(0, HEIGHT, 20))
     side = np.stack([RADIUS * np.cos(around), RADIUS * np.sin(around), up], -1).reshape(-1, 3)
-    if not closed:
-        side = side[side[:, 0] < 0.02]
     rng = np.random.default_rng(0)
     inner = np.stack([0.02 * rng.normal(size=60), 0.02 * rng.normal(size=60), rng.uniform(0.02, 0.08, 60)], -1)
     inner = inner[np.hypot(*inner[:, :2].T) < 0.8 * RADIUS]  # lumps where no camera saw the wall
@@ -52,7 +50,7 @@ def test_vessel_has_walls_a_floor_and_an_open_inside(turned):
     middle = np.array([[0.0, 0.0, 0.5 * STEP], [0.0, 0.0, 0.05], [0.0, 0.0, 0.12]])
     assert (np.sign(distance(middle)) == [-1, 1, 1]).all()  # floor, inside, above
     # within the wall's thickness of the outline, a voxel more or less
-    assert distance(np.array([[0.0, 0.0, 0.06]]))[0] == pytest.approx(RADIUS - 2 * STEP, abs=1.5 * STEP)
+    assert distance(np.array([[0.4 * RADIUS, 0.0, 0.06]]))[0] == pytest.approx(0.6 * RADIUS - 2 * STEP, abs=1.5 * STEP)
 
 
 def test_points_fill_it_up_to_a_level():
@@ -79,7 +77,7 @@ def test_box_points_lie_at_the_centres_of_cells():
 
 def test_what_holds_no_water_is_named():
     with pytest.raises(InputError, match=r"mug: .*hollow"):
-        vessel_from_gaussians(cup(), spacing=0.02, name="mug")  # walls as thick as the cup
+        vessel_from_gaussians(cup(), spacing=0.02, name="mug")  # a wall of 4 cm
     with pytest.raises(InputError, match="spacing = 0"):
         vessel_from_gaussians(cup(), spacing=0.0)
     with pytest.raises(InputError, match=r"wall = 0\.001"):

@@ -8,7 +8,7 @@ from pigjax import io
 from pigjax.core.errors import SceneError
 from pigjax.scene import export_run, load_run, run_scene, scene_from
 from pigjax.scene.arrangement import arrange
-from pigjax.scene.plan import make_plan, read_inputs, segment
+from pigjax.scene.plan import make_plan, provenance, read_inputs, segment
 
 WATER = {"material": "water", "bulk_modulus": 2e3, "colour": [0.2, 0.4, 0.8]}
 
@@ -21,7 +21,11 @@ def folder(tmp_path_factory):
 
 
 def scene(folder, volumes, *, frames=1, ball=None, **simulation):
-    base = values(simulation__dx=0.08, objects={"ball": ball or {"id": 1, "material": "jelly", "young": 2e3}})
+    base = values(
+        camera={"width": 24, "height": 20, "target": [0, 0, 0.5], "radius": 2.0},
+        simulation__dx=0.08,
+        objects={"ball": ball or {"id": 1, "material": "jelly", "young": 2e3}},
+    )
     base["simulation"] |= {"frames": frames, **simulation}
     return scene_from(base | {"volumes": volumes}, folder=folder)
 
@@ -85,8 +89,15 @@ def test_run_keeps_and_draws_it(folder, tmp_path):
     assert float(np.asarray(after.opacities)[mine].max()) < 0.8
     (path,) = export_run(run, "surface", tmp_path / "out", frames=[1], objects=["drop"])
     assert path.is_file()
-    again = run_scene(scene(folder, shapes | {"drop": {**shapes["drop"], "colour": [0.9, 0.1, 0.1]}}), tmp_path)
-    assert again.sizes["resumed_from_frame"] == 1  # the colour changes no state
+
+
+def test_its_looks_change_no_state(folder):
+    def parts(**fields):
+        asked = scene(folder, {"drop": {"centre": [0.0, 0.0, 0.9], "radius": 0.2, **WATER, **fields}})
+        return provenance(asked, read_inputs(asked))
+
+    assert parts(colour=[0.9, 0.1, 0.1], sheen=0.5, transparency=0.2, grain=0.1) == parts()
+    assert parts(radius=0.25) != parts()
 
 
 @pytest.mark.parametrize(
