@@ -166,10 +166,9 @@ def deform(
     rest = as_splats(gaussians)
     at_rest = jnp.broadcast_to(jnp.eye(3, dtype=F.dtype), (len(gaussians), 3, 3))
     if binding is not None and binding.own is not None:
-        index, x, factors, turned = (
-            None if parts[0] is None else jnp.concatenate(parts)
-            for parts in zip((index, x, factors, turned), _own_pose(gaussians, particles, binding.own, params, turned))
-        )
+        rows, means, shapes, turns = _own_pose(gaussians, particles, binding.own, params, turned)
+        index, x, factors = (jnp.concatenate(parts) for parts in ((index, rows), (x, means), (factors, shapes)))
+        turned = None if turned is None or turns is None else jnp.concatenate([turned, turns])
     return dataclasses.replace(
         rest,
         means=rest.means.at[index].set(x, mode="drop"),

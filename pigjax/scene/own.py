@@ -137,8 +137,8 @@ def with_own(
         entry = scene.objects[name]
         rows = np.flatnonzero(body == moving.index(name))
         if isinstance(entry, VolumeSpec):
-            made = _of_volume(inputs.gaussians, plan, rows, entry.surface == "smooth")
-            parts.append((_fainter(made, entry.transparency), rows))
+            poured = _of_volume(inputs.gaussians, plan, rows, entry.surface == "smooth")
+            parts.append((_fainter(poured, entry.transparency), rows))
             continue
         members = np.flatnonzero(object_id == inputs.ids[name])
         mine = jax.tree.map(lambda values, members=members: values[members], inputs.gaussians)
