@@ -51,9 +51,7 @@ def clip(options) -> None:
     print(run(CLIP, options.out / "clip", size))
     frames = iio.imread(options.out / "clip" / "video.mp4")
     colours, step, written = write_clip(options.media / "clip.gif", frames, fps=24)
-    print(
-        f"\n{len(frames[::step])} pictures of {colours} colours, {written / 1e6:.1f} MB; {len(report['warnings'])} warnings"
-    )
+    print(f"\n{len(frames[::step])} pictures of {colours} colours, {written / 1e6:.1f} MB")
 
 
 def write_clip(path: Path, frames: np.ndarray, *, fps: float) -> tuple[int, int, int]:
