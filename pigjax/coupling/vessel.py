@@ -18,7 +18,8 @@ from pigjax.coupling.solid import shell_of, surface_samples
 from pigjax.mpm.colliders import SampledDistance
 from pigjax.splat import Gaussians
 
-_MARGIN = 4  # samples around the vessel
+_BEYOND = 4  # samples, two cells of the simulation: by which a vessel is solid beyond its outline
+_MARGIN = _BEYOND + 3  # samples around it
 _CLOSED = 2  # samples: gaps between splats are closed up to twice as wide,
 _GAP = 1.5  # or up to twice as many of the typical distances between them
 _AREA = 0.5  # of the median area of the slices: smaller ones at both ends are feet, strays and handles
@@ -40,7 +41,8 @@ def vessel_from_gaussians(
     """Collider of a cup, a bowl or a box: a wall along its outside, a floor, and an inside that is open above. Host.
 
     The wall of a captured vessel is thinner than a cell, and its inside was hardly seen. So the outside decides: each
-    horizontal slice is filled, and what is farther than the thickness of the wall from its outline is the inside.
+    horizontal slice is filled, and what is farther than the thickness of the wall from its outline is the inside. For
+    what comes from outside it is four samples wider than it looks, and narrows to its own width at the rim.
 
         cup = vessel_from_gaussians(mug, spacing=dx / 2)
 
@@ -119,7 +121,10 @@ def _hollowed(taken: Bool[np.ndarray, "x y z"], gap: int, wall: float, name: str
     outline[:, :, : wide[0]], outline[:, :, wide[-1] + 1 :] = outline[:, :, [wide[0]]], outline[:, :, [wide[-1]]]
     outline = ndimage.gaussian_filter(outline, 1.0)
     height = np.arange(taken.shape[2])
-    outer = np.maximum(outline, np.maximum(wide[0] - 0.5 - height, height - wide[-1] - 0.5))
+    # matter at the wall feels nodes up to 1.5 cells behind its face, which all must push it back to the inside: so the
+    # solid goes on outside, less and less towards the rim, over which water flows
+    beyond = np.clip(wide[-1] + 0.5 - height, 0, _BEYOND)
+    outer = np.maximum(outline - beyond, np.maximum(wide[0] - 0.5 - _BEYOND - height, height - wide[-1] - 0.5))
     inner = np.maximum(outline + wall, wide[0] - 0.5 + wall - height)
     if not ((inner < 0) & (outer < 0)).any():
         raise InputError(f"{name}: its walls leave no inside; take a finer simulation.dx, or remove hollow.")

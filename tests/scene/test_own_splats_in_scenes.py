@@ -44,6 +44,7 @@ def scene(folder, *, frames=1, **fields):
     return scene_from(base, folder=folder)
 
 
+@pytest.mark.slow
 def test_own_splats_are_drawn_stored_and_used_again(folder, tmp_path):
     said = []
 
@@ -81,6 +82,7 @@ def test_own_splats_are_drawn_stored_and_used_again(folder, tmp_path):
     np.testing.assert_array_equal(back.gaussians.means, plain.gaussians.means)
 
 
+@pytest.mark.slow
 def test_objects_that_are_carried_keep_their_splats_beside_own_ones(tmp_path):
     two = [ball(60), ball(60, seed=1)]
     io.save_ply(tmp_path / "cloud.ply", two[0])
@@ -109,6 +111,7 @@ def test_objects_that_are_carried_keep_their_splats_beside_own_ones(tmp_path):
     np.testing.assert_allclose(run.splats(0).means, run.gaussians.means, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_sheen_brightens_a_surface_seen_at_a_low_angle(folder, tmp_path):
     run_scene(scene(folder, splats="own", surface="smooth", inside=[0.0, 0.2, 0.6], sheen=0.8), tmp_path)
     run = load_run(tmp_path)
