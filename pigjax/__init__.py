@@ -14,6 +14,7 @@ from pigjax.core.placing import as_gaussians, placed
 from pigjax.core.regions import BoxRegion, HalfSpace, SphereRegion
 from pigjax.core.upright import Upright, find_up
 from pigjax.coupling.binding import at_frame, bind, deform
+from pigjax.coupling.hidden import fill_hidden
 from pigjax.coupling.outliers import cut_outliers
 from pigjax.coupling.own_splats import OwnSplats, make_own_splats
 from pigjax.coupling.sdf_collider import collider_from_gaussians
@@ -21,6 +22,7 @@ from pigjax.coupling.seeding import seed_particles
 from pigjax.coupling.vessel import vessel_from_gaussians
 from pigjax.io import (
     Views,
+    example_folder,
     load_dataset,
     load_gaussians,
     load_masks,
@@ -35,6 +37,7 @@ from pigjax.io import (
 )
 from pigjax.mls_mpm import SimConfig, rollout, step
 from pigjax.mpm import Grid, Health, Particles, Trajectory, fit_grid, make_particles, vast_grid
+from pigjax.mpm.active_grid import choose_box
 from pigjax.mpm.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.forces import Force, ForceField, Impulse, Spring, Wind, grab
@@ -114,6 +117,7 @@ __all__ = [
     "at_frame",
     "bind",
     "boundary_iou",
+    "choose_box",
     "choose_integrator",
     "choose_substeps",
     "collider_from_gaussians",
@@ -123,9 +127,11 @@ __all__ = [
     "deform",
     "eigen_clamp",
     "evaluate_labels",
+    "example_folder",
     "experiment",
     "export_run",
     "extract_object",
+    "fill_hidden",
     "fill_unseen",
     "find_up",
     "fit",
@@ -185,3 +191,8 @@ __all__ = [
     "vessel_from_gaussians",
     "write_video",
 ]
+
+
+def __dir__() -> list[str]:
+    """The public names alone, for completion and `dir`; subpackages are imported by their path."""
+    return sorted(__all__)

@@ -46,6 +46,7 @@ from pigjax.core.arrays import is_known
 from pigjax.core.errors import InputError
 from pigjax.core.regions import Region
 from pigjax.mpm import Grid, Health, Particles, SimConfig, StepHealth, Trajectory
+from pigjax.mpm.active_grid import choose_box
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact, broken_by
 from pigjax.mpm.forces import Force, check_forces
@@ -65,8 +66,9 @@ from pigjax.mpm.timestep import (
     substep_rule,
 )
 
-__all__ = ["SimConfig", "choose_integrator", "choose_substeps", "rollout", "stable_dt", "step"]
+__all__ = ["SimConfig", "choose_box", "choose_integrator", "choose_substeps", "rollout", "stable_dt", "step"]
 _SMALL = 50_000  # nodes of a domain that is held whole: less than other costs of a step
+_EMPTY = 32  # nodes a particle, of which matter fills at most a few
 _UNDECIDED = (
     "is traced by jit, grad or vmap and cannot choose its integrator: give SimConfig one, or what choose_integrator"
     " finds from concrete values."
@@ -114,6 +116,7 @@ def step(
     """
     _check_table(particles, table)
     _check_contact(particles, config, contact)
+    _check_rigid(particles, table, config, contact)
     check_forces(forces, len(particles))
     check_gravity(gravity)
     if is_known(dt) and not 0 <= float(dt) < math.inf:
@@ -150,9 +153,9 @@ def rollout(
 
     With concrete arrays, only the active part of the grid is allocated; a domain of at most 50,000 nodes is held whole
     unless `sleep` is given. Inside jit, grad and vmap the whole grid is allocated, or a window of `config.box` nodes
-    that moves with matter: give a grid that `fit_grid` has fitted. Reverse mode keeps O(√n) checkpoints of n steps, at
-    least one for each frame, and recomputes the states between them (Griewank and Walther 2000); with a window it also
-    keeps the inputs of each frame.
+    that moves with matter (`choose_box` finds it): give a grid that `fit_grid` has fitted. Reverse mode keeps O(√n)
+    checkpoints of n steps, at least one for each frame, and recomputes the states between them (Griewank and Walther
+    2000); with a window it also keeps the inputs of each frame.
 
     Args:
         particles: p of them, in any order of materials.
@@ -181,6 +184,7 @@ def rollout(
     """
     _check_table(particles, table)
     _check_contact(particles, config, contact)
+    _check_rigid(particles, table, config, contact)
     check_forces(forces, len(particles))
     check_steps(frames, frame_dt, gravity)
     shared = (particles, grid, table, frame_dt, gravity, colliders, contact, pins, forces)
@@ -196,6 +200,7 @@ def rollout(
             )
         if config.integrator == "auto":
             raise InputError(f"rollout {_UNDECIDED}")
+        _warn_of_empty_nodes(grid, len(particles), config)
         dt = jnp.asarray(frame_dt) / config.substeps
         return _compiled(
             particles, grid, table, config, dt, gravity, colliders, contact, pins, forces, frames, config.substeps
@@ -265,6 +270,18 @@ def _compiled(
     return simulate_compiled(particles, grid, table, config, inputs, frames=frames)
 
 
+def _warn_of_empty_nodes(grid: Grid, particles: int, config: SimConfig) -> None:
+    """Warn where a traced rollout visits many more nodes than matter can fill."""
+    nodes = math.prod(grid.shape)
+    if config.box is None and nodes > max(_SMALL, _EMPTY * particles):
+        warnings.warn(
+            f"rollout is traced by jit, grad or vmap and visits all {nodes} nodes of its grid in each step, for"
+            f" {particles} particles: give SimConfig the box that choose_box finds from one rollout outside, or fit the"
+            " grid with fit_grid.",
+            stacklevel=3,
+        )
+
+
 def _like(tree: Any, particles: Particles) -> Any:
     """The same tree of numbers in the precision of the particles."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, particles.x.dtype), tree)
@@ -277,6 +294,26 @@ def _check_table(particles: Particles, table: MaterialTable) -> None:
         raise InputError(
             f"The material table has {len(table)} rows, the particles were made for one of {len(particles.counts)}."
         )
+
+
+def _check_rigid(particles: Particles, table: MaterialTable, config: SimConfig, contact: BodyContact | None) -> None:
+    """Rigid matter takes explicit steps, and a grid of its own wherever there is other matter."""
+    rigid = sum(count for count, law in zip(particles.counts, table.laws) if law == "rigid")
+    if not rigid:
+        return
+    if (rule := broken_by(config.integrator)) is not None:
+        raise InputError(f"SimConfig.integrator = {config.integrator!r}: {rule}, which rigid matter takes, too.")
+    one = not is_known(particles.body) or len(np.unique(np.asarray(particles.body))) == 1
+    if contact is None and (rigid < len(particles) or not one):
+        raise InputError(
+            "contact = None: a rigid body beside other matter needs a grid of its own; number the bodies by"
+            " make_particles(body=...) and give contact=BodyContact(bodies=...)."
+        )
+    if is_known(particles.body, particles.material):
+        body, law = np.asarray(particles.body), np.asarray([law == "rigid" for law in table.laws])
+        own = law[np.asarray(particles.material)]
+        if (mixed := np.intersect1d(body[own], body[~own])).size:
+            raise InputError(f"Particles.body = {mixed[0]}: it is rigid in part; give the rest a body of its own.")
 
 
 def _check_contact(particles: Particles, config: SimConfig, contact: BodyContact | None) -> None:

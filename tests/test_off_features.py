@@ -25,6 +25,7 @@ NUMBERS = {  # in the order of LAWS, what each law reads
     "neo_hookean": set(),
     "stvk_hencky": set(),
     "fibres": {"fibre_stiffness", "fibre_azimuth", "fibre_elevation"},
+    "tearing_neo_hookean": {"tearing_stretch"},
     "von_mises": {"yield_stress", "hardening_modulus", "residual_stress"},
     "plasticine": {"yield_stress", "hardening_modulus", "residual_stress"},
     "drucker_prager": {"friction_angle", "cohesion"},
@@ -37,6 +38,7 @@ FLOOR = {"point": jnp.asarray([0.0, 0.0, 0.4]), "normal": jnp.asarray([0.0, 0.0,
 
 def material(law, **numbers):
     given = {"yield_stress": 1e3, "friction_angle": 0.6, "viscosity": 1.0, "bulk_modulus": 1e4, "fibre_stiffness": 1e4}
+    given["tearing_stretch"] = 1.2
     own = {name: given[name] for name in NUMBERS[law] if name in given}
     return Material(law, **{**ELASTIC, **own, **numbers})
 
@@ -117,7 +119,7 @@ def test_an_option_at_its_off_value_changes_nothing(plain, off):
 
 def test_numbers_that_no_law_present_reads_change_nothing(plain):
     """Viscosity, hardening, fibres and the rest, given to elastic matter: the same program, for other values."""
-    foreign = {name: 0.5 for names in NUMBERS.values() for name in names}
+    foreign = {name: 0.5 for names in NUMBERS.values() for name in names} | {"tearing_stretch": 1.5}
     assert text(traced([material("neo_hookean", **foreign)])) == text(plain)
 
 
@@ -143,6 +145,7 @@ SIGNS = {
     "drucker_prager": (lambda: traced([material("drucker_prager")]), lambda p: primitives(p)["tan"] > 0),
     "von_mises": (lambda: traced([material("von_mises")]), lambda p: primitives(p)["exp"] > 0),
     "foam": (lambda: traced([material("foam")]), lambda p: primitives(p)["pow"] > 0),
+    "rigid bodies": (lambda: traced([Material("rigid", density=1e3)]), lambda p: primitives(p)["sin"] > 0),
     "gusts": (lambda: traced(forces=(Wind((1.0, 0, 0), 1.0, gusts=1.0),)), lambda p: primitives(p)["cos"] > 0),
 }
 
@@ -160,6 +163,12 @@ def test_laws_of_the_table_without_particles_are_not_traced(plain):
     for law in ("fibres", "fluid", "drucker_prager", "von_mises", "foam"):
         assert not SIGNS[law][1](program), law
     assert in_steps(program) == in_steps(plain)
+
+
+def test_matter_that_does_not_tear_pays_nothing_for_it(plain):
+    torn, whole = material("tearing_neo_hookean"), material("neo_hookean")
+    assert in_steps(traced([torn])).total() > in_steps(plain).total()
+    assert in_steps(traced([whole, torn])) == in_steps(plain)
 
 
 def test_colliders_at_rest_are_found_once_and_moving_ones_in_each_step(plain):

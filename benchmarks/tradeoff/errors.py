@@ -2,8 +2,12 @@
 
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import zoom
+
+from pigjax.core.metrics import ssim
 
 
 class Displacement(NamedTuple):
@@ -42,6 +46,16 @@ def video_psnr(frames, reference) -> float:
     reference = np.asarray(reference, np.float64)
     frames = enlarged(np.asarray(frames, np.float64), reference.shape[1:3])
     return float(-10 * np.log10(np.mean((frames - reference) ** 2)))
+
+
+def video_ssim(frames, reference) -> float:
+    """Mean structural similarity of all frames [t h w 3] in [0, 1]; smaller frames are first enlarged."""
+    reference = jnp.asarray(reference)
+    frames = jnp.asarray(enlarged(np.asarray(frames, np.float64), reference.shape[1:3]), reference.dtype)
+    return float(np.mean([_ssim(frame, of) for frame, of in zip(frames, reference)]))
+
+
+_ssim = jax.jit(ssim)
 
 
 def root_mean_square(frames, reference) -> float:

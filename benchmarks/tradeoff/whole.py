@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.common.timing import in_turn
-from benchmarks.tradeoff.errors import root_mean_square, video_psnr
+from benchmarks.tradeoff.errors import root_mean_square, video_psnr, video_ssim
 from benchmarks.tradeoff.points import Point, by_scene
 from benchmarks.tradeoff.scenes import draw, simulate, source
 
@@ -40,8 +40,11 @@ def _study(name):
         if key != "reference":
             knob = "accuracy" if key in LEVELS else KNOBS.get(key, ("matter",))[0]
             psnr = video_psnr(run.result, reference)
+            alike = video_ssim(run.result, reference)
             error = root_mean_square(run.result, reference)
-            points.append(Point(key, knob, run.seconds, error, run.compile_seconds, f"PSNR {psnr:.1f} dB"))
+            points.append(
+                Point(key, knob, run.seconds, error, run.compile_seconds, f"PSNR {psnr:.1f} dB, SSIM {alike:.3f}")
+            )
     reseeded = video_psnr(_video(of, of.scene(**SEED)), standard)
     said = (
         f"Reference: {timed['reference'].seconds:.3g} s. Floor: another seed of the filling changes the standard's"

@@ -53,7 +53,9 @@ def reconstruct(
         ),
     ] = None,
     steps: Annotated[int, typer.Option(help="Optimisation steps.", min=1)] = 3000,
-    splats: Annotated[int, typer.Option(help="Number of Gaussians.", min=4)] = 15_000,
+    splats: Annotated[
+        int | None, typer.Option(help="Number of Gaussians; one for 140 pixels of the photos if not given.", min=4)
+    ] = None,
     sh_degree: Annotated[int, typer.Option(help="Bands of view-dependent colour.", min=0, max=3)] = 1,
     background: Annotated[float, typer.Option(help="Grey level behind the scene: 0 black, 1 white.")] = 0.0,
     max_size: Annotated[int | None, typer.Option(help="Shrink photos to this many pixels.")] = None,
@@ -63,9 +65,18 @@ def reconstruct(
     ] = None,
     only: Annotated[int | None, typer.Option(help="Fit only what the masks give this id.")] = None,
     random_background: Annotated[bool, typer.Option(help="A new colour each step behind what masks cover.")] = False,
+    exposure: Annotated[bool, typer.Option(help="Fit gains of red, green and blue to each photo.")] = False,
+    shell: Annotated[float, typer.Option(help="Share of Gaussians on a far sphere, for sky.", min=0, max=0.99)] = 0.0,
+    halvings: Annotated[int, typer.Option(help="Begin with photos halved this often.", min=0, max=8)] = 0,
+    error_views: Annotated[
+        int, typer.Option(help="Photos whose errors draw Gaussians before a relocation; 0: by opacity.", min=0)
+    ] = 0,
+    antialias: Annotated[
+        bool, typer.Option(help="Opacities follow the dilation, as in Mip-Splatting; draw with antialias=True.")
+    ] = False,
     refine_poses: Annotated[bool, typer.Option(help="Correct training cameras, into OUT/poses.json.")] = False,
     previews: Annotated[int, typer.Option(help="Steps between preview pictures; 0 for none.", min=0)] = 0,
-    seed: int = 0,
+    seed: Annotated[int, typer.Option(help="Of random numbers, such as the order of photos.")] = 0,
     origin: Origin = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -78,10 +89,10 @@ def reconstruct(
     from pigjax import io
     from pigjax.reconstruction.reconstruct import FitConfig, provenance, reconstruct
     from pigjax.reconstruction.reconstruct import Progress as Step
+    from pigjax.reconstruction.train import splat_budget
     from pigjax.splat import RenderConfig
 
     needs_masks = only is not None or random_background
-    doublings = max(math.ceil(math.log2(splats / start_splats)), 1) if start_splats else 1
     loaded = io.load_views(
         views,
         images=images,
@@ -92,6 +103,9 @@ def reconstruct(
         origin=origin,
     )
     points = io.load_points(loaded.points_path, origin=origin) if loaded.points_path else None
+    train = loaded.training.cameras
+    splats = splat_budget(len(train), train.width, train.height) if splats is None else splats
+    doublings = max(math.ceil(math.log2(splats / start_splats)), 1) if start_splats else 1
     config = FitConfig(
         steps=steps,
         splats=splats,
@@ -102,15 +116,20 @@ def reconstruct(
         object_id=only,
         random_background=random_background,
         pose_rate=5e-4 if refine_poses else 0.0,
+        exposure_rate=5e-3 if exposure else 0.0,
+        shell=shell,
+        halvings=halvings,
+        error_views=error_views,
         preview_every=previews,
         seed=seed,
-        render=RenderConfig(bands=jax.local_device_count()),
+        render=RenderConfig(bands=jax.local_device_count(), antialias=antialias),
     )
     if out is None:
         out = Path(f"reconstruction-{_name_of(views)}")
     out = io.output_folder(out, files=("gaussians.ply", "poses.json", "report.json"), folders=("previews",))
     results = ("gaussians.ply", "poses.json", "report.json", "checkpoint", "previews")
     io.claim(out, provenance(loaded, config, points), results=results, overwrite=overwrite)
+    console.print(said(_plan(loaded, config, points)), soft_wrap=True)
     with progress("{task.fields[state]}") as bar:
         task, last = bar.add_task("reconstruct", total=steps, state=""), [""]
 
@@ -133,12 +152,23 @@ def reconstruct(
         poses = dict(zip(result.trained_on, result.cameras.world_to_cam.tolist()))
         io.write_json(out / "poses.json", {"world_to_cam": poses})
     io.write_json(out / "report.json", {"psnr": result.psnr, "ssim": result.ssim, "mean_psnr": result.mean_psnr,
+                                        "corrected_psnr": result.corrected_psnr,
                                         "history": [step._asdict() for step in result.history]})  # fmt: skip
     table = Table("held-out view", "PSNR dB", "SSIM")
     for name in result.psnr:
         table.add_row(*row(name, f"{result.psnr[name]:.2f}", f"{result.ssim[name]:.4f}"))
     console.print(table)
     console.print(said(f"mean PSNR {result.mean_psnr:.2f} dB, SSIM {result.mean_ssim:.4f}; {out / 'gaussians.ply'}"))
+
+
+def _plan(views: Any, config: Any, points: Any) -> str:
+    """What a reconstruction will do, in a line."""
+    held_out, camera = views.held_out, views.cameras
+    start = "random points" if points is None else f"{len(points[0]):,} sparse points"
+    return (
+        f"{len(views.training)} photos of {camera.width}x{camera.height} px, {len(held_out or ())} held out;"
+        f" {config.splats:,} Gaussians of SH degree {config.sh_degree} from {start}; {config.steps:,} steps"
+    )
 
 
 def _name_of(views: Path) -> str:

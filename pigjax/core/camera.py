@@ -7,6 +7,7 @@ from functools import partial
 from numbers import Integral
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -48,7 +49,7 @@ class Camera(eqx.Module):
 
         Solved from the whole matrix: -Rᵀt is right only on the rigid manifold, so its pose gradients are wrong off it.
         """
-        return jnp.linalg.inv(self.world_to_cam)[..., :3, 3]
+        return _centres(self.world_to_cam)
 
     def __getitem__(self, index) -> Camera:
         """One camera, or a slice, of a batch.
@@ -309,6 +310,11 @@ def focus_of(cameras: Camera) -> Float[np.ndarray, "3"]:
     middle = position.mean(0)
     offset = np.einsum("vij,vj->i", across, position - middle)
     return middle + np.linalg.lstsq(across.sum(0), offset, rcond=1e-6)[0]
+
+
+@partial(jax.jit, inline=True)
+def _centres(world_to_cam: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 3"]:
+    return jnp.linalg.inv(world_to_cam)[..., :3, 3]
 
 
 def _vector(name: str, value: Vector) -> Float[Array, "3"]:

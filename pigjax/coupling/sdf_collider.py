@@ -138,19 +138,33 @@ def signed_distance(
         width: least width of the weights [m].
         tree: of the points, where there is one already.
     """
+    return tangent_planes(at, points, normals, width, tree)[0]
+
+
+def tangent_planes(
+    at: Float[np.ndarray, "p 3"],
+    points: Float[np.ndarray, "s 3"],
+    normals: Float[np.ndarray, "s 3"],
+    width: float,
+    tree: cKDTree | None = None,
+) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p 3"]]:
+    """`signed_distance`, and the unit normal of the plane that it is measured from; the arguments are the same."""
     tree = cKDTree(points) if tree is None else tree
-    parts = [_distance(at[k : k + _TOGETHER], points, normals, width, tree) for k in range(0, len(at), _TOGETHER)]
-    return np.concatenate(parts) if parts else np.zeros(0)
+    parts = [_plane(at[k : k + _TOGETHER], points, normals, width, tree) for k in range(0, len(at), _TOGETHER)]
+    if not parts:
+        return np.zeros(0), np.zeros((0, 3))
+    distance, normal = (np.concatenate(column) for column in zip(*parts))
+    return distance, normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
-def _distance(
+def _plane(
     at: Float[np.ndarray, "p 3"],
     points: Float[np.ndarray, "s 3"],
     normals: Float[np.ndarray, "s 3"],
     width: float,
     tree: cKDTree,
-) -> Float[np.ndarray, "p"]:
-    """`signed_distance` of so many points that their neighbours fit into little memory."""
+) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p 3"]]:
+    """`tangent_planes` of so many points that their neighbours fit into little memory; normals are not unit."""
     gap, nearest = tree.query(at, k=min(_NEIGHBOURS, len(points)), workers=-1)
     gap, nearest = gap.reshape(len(at), -1), nearest.reshape(len(at), -1)
     reach = np.maximum(width, 0.5 * gap[:, :1])
@@ -161,4 +175,4 @@ def _distance(
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     # between two sides the normals cancel: there the normal of the nearest point is used
     normal = np.where(length > 0.1, normal / np.maximum(length, 0.1), normals[nearest[:, 0]])
-    return np.sum((at - centre) * normal, 1)
+    return np.sum((at - centre) * normal, 1), normal

@@ -195,7 +195,7 @@ def _matter_of(
     points, contents = lattice_cells(solid, step, max_particles=max_particles, name=name)
     vacant = ~_taken(points, item, objects)
     for collider in colliders:
-        vacant &= np.asarray(collider.distance(jnp.asarray(points))) > 0
+        vacant &= collider.distances_of(points) > 0
     points, contents = points[vacant], contents[vacant]
 
     own = np.flatnonzero(shell.connected)

@@ -24,6 +24,7 @@ _LEAST_SKY = 2.0  # a sample that sees less of the outside, or sees it on both s
 _LEAST_DISCS = 8
 _EYES = 16  # cameras that are asked for the outer side of a surface
 _LEAST_TOWARDS = 0.05  # of their mean unit direction along a normal; less is seen from both sides, or hidden
+_LEAST_RISE = 0.3  # sine of the elevation of the directions from which things on a surface hide it; cameras look down
 _LEAST_JUMP = 0.3  # least jump of the winding number across the surface of a shell
 _FULL = 0.25  # share of inner voxels with Gaussians in them above which a cloud is filled, not a shell
 _MOST_SWELLING = 2.0  # volume of a filled cloud's density over that of its winding number; strays in a shell exceed it
@@ -247,7 +248,7 @@ def _discs_of(
     means = shell.means[kept]
     origin = means.min(0) - _MARGIN * voxel
     shape = np.ceil(np.ptp(means, axis=0) / voxel).astype(int) + 2 * _MARGIN + 1
-    samples = _disc_samples(shell, kept, voxel)
+    samples = disc_samples(shell, kept, voxel)
     cells = np.floor((samples - origin) / voxel).astype(int)
     near = np.all((cells >= 1) & (cells < shape - 1), 1)
     flat, owner, counts = np.unique(np.ravel_multi_index(cells[near].T, shape), return_inverse=True, return_counts=True)
@@ -266,11 +267,16 @@ def _discs_of(
     return (discs if discs.areas.any() else None), occupied, origin
 
 
-def _disc_samples(shell: Shell, kept: Bool[np.ndarray, "n"], voxel: float) -> Float[np.ndarray, "s 3"]:
+def disc_samples(shell: Shell, kept: Bool[np.ndarray, "n"], voxel: float) -> Float[np.ndarray, "s 3"]:
     """Points on each Gaussian's disc of one standard deviation, about one per voxel; a round one gives its centre.
 
     Discs are clamped to a quarter of the object, and to twice the distance to their sixth neighbour: wider Gaussians do
     not describe its surface, which their neighbours do there, but stand out from it wherever it is curved.
+
+    Args:
+        shell: of `shell_of`.
+        kept: Gaussians that are sampled.
+        voxel: distance between samples [m].
     """
     means, axes = shell.means[kept], shell.axes[kept]
     widest = _widest(means, voxel)[:, None]
@@ -296,6 +302,34 @@ def _widest(means: Float[np.ndarray, "n 3"], voxel: float) -> Float[np.ndarray, 
         return np.full(len(means), quarter)
     distances, _ = cKDTree(means).query(means, k=7, workers=-1)
     return np.minimum(quarter, np.maximum(2 * distances[:, -1], voxel))
+
+
+def share_seen(
+    points: Float[np.ndarray, "s 3"],
+    blockers: Float[np.ndarray, "b 3"],
+    voxel: float,
+    up: Float[np.ndarray, "3"],
+    eyes: Float[np.ndarray, "e 3"] | None = None,
+) -> Float[np.ndarray, "s"]:
+    """Share of the cameras, or of the sky where these are not known, that other objects do not hide from each point.
+
+    Args:
+        points: of a surface [m].
+        blockers: samples of the other objects [m], at most a voxel apart.
+        voxel: edge of the voxels that they fill [m].
+        up: unit vector.
+        eyes: positions of the cameras [m], of which some sixteen are tried; None: not known.
+    """
+    low = np.minimum(points.min(0), blockers.min(0)) - _MARGIN * voxel
+    high = np.maximum(points.max(0), blockers.max(0)) + _MARGIN * voxel
+    occupied = np.zeros(np.ceil((high - low) / voxel).astype(int) + 1, bool)
+    occupied[tuple(np.floor((blockers - low) / voxel).astype(int).T)] = True
+    cells = (points - low) / voxel
+    if eyes is not None:
+        return np.mean([_open_to(eye, occupied, points, cells)[0] for eye in _some(eyes)], axis=0)
+    upward = _DIRECTIONS[_DIRECTIONS @ up > _LEAST_RISE * np.linalg.norm(_DIRECTIONS, axis=1)]
+    index = tuple(np.floor(cells).astype(int).T)
+    return np.mean([~_blocked(occupied, direction)[index] for direction in upward], axis=0)
 
 
 def _sky(
@@ -338,24 +372,39 @@ def _towards_eyes(
         cells: the same, in voxels.
         eyes: positions of the cameras [m]; some sixteen of them, spread over all, are tried.
     """
-    total, shape = np.zeros((len(points), 3)), np.array(occupied.shape)
-    for eye in eyes[np.unique(np.linspace(0, len(eyes) - 1, _EYES).astype(int))]:
-        direction = eye - points
-        distance = np.linalg.norm(direction, axis=1, keepdims=True)
-        direction = direction / np.maximum(distance, 1e-12)
-        open_ = np.ones(len(points), bool)
-        ahead = np.arange(len(points))  # those whose ray is still within the grid
-        for step in range(2, int(np.linalg.norm(shape)) + 2):  # the first voxels hold the surface itself
-            place = np.floor(cells[ahead] + step * direction[ahead]).astype(int)
-            within = np.all((place >= 0) & (place < shape), 1)
-            ahead, place = ahead[within], place[within]
-            if not len(ahead):
-                break
-            hit = occupied[tuple(place.T)]
-            open_[ahead[hit]] = False
-            ahead = ahead[~hit]
+    total = np.zeros((len(points), 3))
+    for eye in _some(eyes):
+        open_, direction = _open_to(eye, occupied, points, cells)
         total += open_[:, None] * direction
     return total / max(min(_EYES, len(eyes)), 1)
+
+
+def _some(eyes: Float[np.ndarray, "e 3"]) -> Float[np.ndarray, "_ 3"]:
+    return eyes[np.unique(np.linspace(0, len(eyes) - 1, _EYES).astype(int))]
+
+
+def _open_to(
+    eye: Float[np.ndarray, "3"],
+    occupied: Bool[np.ndarray, "x y z"],
+    points: Float[np.ndarray, "s 3"],
+    cells: Float[np.ndarray, "s 3"],
+) -> tuple[Bool[np.ndarray, "s"], Float[np.ndarray, "s 3"]]:
+    """Whether no occupied voxel lies between each point and a camera, and the unit direction to the camera."""
+    shape = np.array(occupied.shape)
+    direction = eye - points
+    direction = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
+    open_ = np.ones(len(points), bool)
+    ahead = np.arange(len(points))  # those whose ray is still within the grid
+    for step in range(2, int(np.linalg.norm(shape)) + 2):  # the first voxels hold the surface itself
+        place = np.floor(cells[ahead] + step * direction[ahead]).astype(int)
+        within = np.all((place >= 0) & (place < shape), 1)
+        ahead, place = ahead[within], place[within]
+        if not len(ahead):
+            break
+        hit = occupied[tuple(place.T)]
+        open_[ahead[hit]] = False
+        ahead = ahead[~hit]
+    return open_, direction
 
 
 def _oriented_discs(

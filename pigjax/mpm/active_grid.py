@@ -16,15 +16,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float
 
+from pigjax.core.arguments import checked
+from pigjax.core.arrays import Vector
 from pigjax.core.errors import SimulationError
 from pigjax.mpm import WALL, Grid, Health, Particles, SimConfig, Trajectory
 from pigjax.mpm.materials import LAWS, MaterialTable
-from pigjax.mpm.program import GridWindow, StepInputs, run_frames
+from pigjax.mpm.program import AXIS, GridWindow, StepInputs, run_frames
 
 LARGEST = 200_000_000  # nodes
-_ROOM = 1.3  # factor on the sides that a window needs: another size is another compilation
+_ROOM = 1.4  # factor on the sides that a window needs: another size is another compilation
 _ROOM_OF_ONE = 1.15  # the same for a window of fixed size, for motion that is faster than the runs that sized it
 _UNIT = 4  # nodes, of which sides are multiples
 _AROUND = 6  # nodes a side of a window of fixed size beyond the extent of matter: the kernel's, and some room
@@ -54,6 +57,7 @@ class ActiveGrid:
         Raises:
             SimulationError: matter has spread so far that its grid would not fit into memory.
         """
+        particles = replicated(particles, devices)  # or the frame after the first one would be compiled again
         ends = _ends(particles.x, particles.v, inputs.duration, inputs.gravity)
         while True:
             window = self._window(np.asarray(ends, np.float64), len(particles), domain)
@@ -64,7 +68,7 @@ class ActiveGrid:
             # a displacement of a whole window in one step, or NaN, is a breakdown: no larger window would hold it
             broken = not health.max_courant < max(self.shape)
             if broken or not inner.any():
-                return moved, path, health
+                return moved, path, jax.device_get(health)
             self.slack *= 2
 
     def memory(self) -> Float[np.ndarray, "n"]:
@@ -130,6 +134,39 @@ def box_for(
     return (nx, ny, nz) if 2 * _nodes((nx, ny, nz)) <= _nodes(domain.shape) else None
 
 
+@checked
+def choose_box(
+    particles: Particles,
+    path: Trajectory,
+    grid: Grid,
+    table: MaterialTable,
+    *,
+    frame_dt: Float[Array, ""] | float,
+    gravity: Vector,
+) -> tuple[int, int, int] | None:
+    """A `SimConfig.box` for rollouts like one that is known (host).
+
+    Inside jit, grad and vmap a rollout visits all nodes of its grid, unless it has such a box. Simulate once outside,
+    at the extremes of the parameters where they matter, and take the largest box. Matter that outruns a box is held
+    back at its edge and counted in `Health.escaped`.
+
+        end, path, health = pj.rollout(particles, grid, table, config, frames=24, frame_dt=1 / 24, gravity=gravity)
+        config = replace(config, box=pj.choose_box(particles, path, grid, table, frame_dt=1 / 24, gravity=gravity))
+
+    Args:
+        particles: at the start.
+        path: of that rollout.
+        grid: the whole domain.
+        table: materials.
+        frame_dt: duration of a frame [s].
+        gravity: [m/s²].
+
+    Returns:
+        Nodes a side, with 15 % more than the rollout used; None where a box would hold more than half of the domain.
+    """
+    return box_for([(particles, path, float(frame_dt), gravity)], table, grid)
+
+
 def window_around(
     particles: Particles, table: MaterialTable, domain: Grid, shape: tuple[int, int, int], inputs: StepInputs
 ) -> GridWindow:
@@ -166,6 +203,18 @@ def devices_for(config: SimConfig, count: int) -> int:
 def _nodes(shape: Iterable[Any]) -> int:
     """Number of nodes, in Python's integers, which do not overflow."""
     return math.prod(map(int, shape))
+
+
+def replicated(particles: Particles, devices: int) -> Particles:
+    """Particles that every one of the devices that share a simulation holds; those of a single one as they are.
+
+    A compiled program is one for the placement of its inputs: first particles come from one device, later ones are
+    left by a frame on several.
+    """
+    if devices == 1:
+        return particles
+    mesh = Mesh(np.array(jax.local_devices()[:devices]), (AXIS,))
+    return jax.device_put(particles, NamedSharding(mesh, PartitionSpec()))
 
 
 @jax.jit

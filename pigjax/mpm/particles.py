@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -105,10 +107,17 @@ def make_particles(
         C=jnp.zeros_like(eye),
         F_visual=eye,
         volume0=volume,
-        mass=volume * table.density[rows].astype(x.dtype),
+        mass=_masses(volume, table.density, rows),
         material=jnp.asarray(rows, jnp.int32),
         hardening=jnp.zeros(count, x.dtype),
         gaussian=jnp.broadcast_to(jnp.asarray(gaussian, jnp.int32), (count,)),
         body=jnp.broadcast_to(jnp.asarray(body, jnp.int32), (count,)),
         counts=tuple(int(n) for n in np.bincount(rows, minlength=len(table))),
     )
+
+
+@partial(jax.jit, inline=True)
+def _masses(
+    volume: Float[Array, "p"], density: Float[Array, "m"], rows: Int[Array, "p"] | Int[np.ndarray, "p"]
+) -> Float[Array, "p"]:
+    return volume * density[rows].astype(volume.dtype)

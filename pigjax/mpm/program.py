@@ -34,6 +34,7 @@ from pigjax.mpm import (
     to_rows,
 )
 from pigjax.mpm.adjoint import Steps, run_steps
+from pigjax.mpm.boundaries import touched_nodes
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.forces import Force, columns_of, weights_of, without_weights
@@ -46,12 +47,11 @@ from pigjax.mpm.substep import (
     grid_to_particles,
     particles_to_grid,
     substep,
-    touched_nodes,
     update_grid,
 )
 from pigjax.mpm.transfers import KERNELS
 
-_AXIS = "particles"
+AXIS = "particles"
 
 
 class GridWindow(eqx.Module):
@@ -140,6 +140,7 @@ def run_frames(
         unit_mass=lax.stop_gradient(jnp.where(jnp.isfinite(particles.mass), particles.mass, 0).max()),
         opaque_true=everywhere(~(particles.volume0[0] < -jnp.finfo(dtype).max)),  # true of NaN too
         forces=without_weights(inputs.forces),
+        rigid=_rigid_bodies(particles, table, bodies),
     )
     statics = StepStatics(
         kernel=kernel,
@@ -150,21 +151,22 @@ def run_frames(
         newton_steps=config.newton_steps,
         newton_tolerance=config.newton_tolerance,
         krylov_steps=config.krylov_steps,
-        axis=_AXIS if devices > 1 else None,
+        axis=AXIS if devices > 1 else None,
         fillers=sum(-len(part) % devices for part, moves in zip(grouping.parts, grouping.moves) if moves),
         force_columns=columns_of(inputs.forces),
         warp=warp,
         in_order=config.deterministic,
+        contact_rounds=config.contact_rounds,
     )
     run = partial(_frames, statics, config, frames, inputs.substeps, of or frames)
     if devices > 1:
-        whole, shared = PartitionSpec(), PartitionSpec(_AXIS)
-        mesh = Mesh(np.array(jax.local_devices()[:devices]), (_AXIS,))
+        whole, shared = PartitionSpec(), PartitionSpec(AXIS)
+        mesh = Mesh(np.array(jax.local_devices()[:devices]), (AXIS,))
         run = jax.shard_map(
             run,
             mesh=mesh,
             in_specs=(whole, shared, whole),
-            out_specs=(shared, PartitionSpec(None, _AXIS), whole),
+            out_specs=(shared, PartitionSpec(None, AXIS), whole),
             check_vma=False,  # of loops whose carries would need marks
         )
     states, paths, (health, sides_met) = run(context, states, inputs.start)
@@ -310,6 +312,15 @@ def _held_nodes(
         inside = region.contains(points)
         touched = inside if touched is None else touched | inside
     return touched
+
+
+def _rigid_bodies(particles: Particles, table: MaterialTable, bodies: int) -> Bool[Array, "b"] | None:
+    """Which bodies have rigid matter; None where there is none. Without contact between bodies all matter is one."""
+    rows = np.array([law == "rigid" for law in table.laws])
+    if not any(count for count, own in zip(particles.counts, rows) if own):
+        return None
+    own = jnp.asarray(rows)[particles.material].astype(int)
+    return jax.ops.segment_max(own, particles.body if bodies > 1 else 0 * particles.body, bodies) > 0
 
 
 def _specific_volume(particles: Particles, bodies: int) -> Float[Array, "b"]:

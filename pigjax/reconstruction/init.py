@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from pigjax.core.camera import Camera, focus_of
@@ -13,6 +13,7 @@ from pigjax.core.extent import scene_extent
 from pigjax.core.gaussians import SH_CONSTANT, Gaussians
 
 _LEAST_SCALE = 1e-6  # of the scene's radius, where points coincide
+_REFINEMENTS = 6  # of the lattice of directions
 
 
 def start_gaussians(
@@ -80,6 +81,67 @@ def covering_sample(points: Float[np.ndarray, "n 3"], count: int, *, seed: int =
             key |= ((digit >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
     share = (np.arange(count) + np.random.default_rng(seed).random(count)) / count
     return np.sort(np.argsort(key, kind="stable")[(share * len(points)).astype(int)])
+
+
+def far_shell(
+    cameras: Camera,
+    points: Float[np.ndarray, "n 3"],
+    images: Float[np.ndarray | Array, "v h w 3"],
+    count: int,
+    *,
+    valid: Bool[np.ndarray | Array, "v h w"] | None = None,
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
+    """Points on a sphere around a scene, where some camera sees them: sky, and background without sparse points. Host.
+
+    The sphere's middle is the point that the cameras look at. Its radius is the distance within which 99 of 100 sparse
+    points lie, and at least twice that of the farthest camera, so that cameras are well inside. Directions are those of
+    a Fibonacci lattice; those that no camera sees are left out, and the lattice is refined until `count` are seen.
+
+    Args:
+        cameras: batch of training views.
+        points: sparse points [m].
+        images: photos of these views, in 0..1.
+        count: number of points.
+        valid: pixels that show the scene; None: all.
+
+    Returns:
+        Positions [m] and colours: the mean of the photos where they show the point.
+    """
+    centre = focus_of(cameras)
+    world_to_cam = np.asarray(cameras.world_to_cam, float)
+    reach = np.linalg.norm(np.asarray(cameras.position, float) - centre, axis=1).max()
+    radius = max(float(np.quantile(np.linalg.norm(points - centre, axis=1), 0.99)), 2 * float(reach))
+    focal, middle = np.asarray(cameras.focal, float), np.asarray(cameras.centre, float)
+    size = np.array([cameras.width, cameras.height])
+    lattice = count
+    for _ in range(_REFINEMENTS):
+        shell = centre + radius * _fibonacci(lattice)
+        total, seen = np.zeros((lattice, 3)), np.zeros(lattice)
+        for k, image in enumerate(np.asarray(images)):
+            local = shell @ world_to_cam[k, :3, :3].T + world_to_cam[k, :3, 3]
+            ahead = local[:, 2] > 1e-6 * radius
+            place = local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None] * focal[k] + middle[k]
+            shown = ahead & (place >= 0).all(1) & (place < size).all(1)
+            column, row = place[shown].astype(int).T
+            if valid is not None:
+                shown[shown] = np.asarray(valid[k])[row, column]
+                column, row = place[shown].astype(int).T
+            total[shown] += image[row, column]
+            seen += shown
+        if (found := int((seen > 0).sum())) >= count:
+            break
+        lattice = int(lattice * min(1.1 * count / max(found, 1), 8)) + 1
+    chosen = np.flatnonzero(seen)
+    chosen = chosen[np.linspace(0, len(chosen) - 1, min(count, len(chosen))).astype(int)]
+    return shell[chosen], total[chosen] / seen[chosen, None]
+
+
+def _fibonacci(count: int) -> Float[np.ndarray, "n 3"]:
+    """Directions spread evenly over the sphere (Gonzalez 2010)."""
+    k = np.arange(count) + 0.5
+    z, turn = 1 - 2 * k / count, k * np.pi * (3 - 5**0.5)
+    across = np.sqrt(1 - z**2)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), z], 1)
 
 
 def random_points(

@@ -20,12 +20,16 @@ DEAD_OPACITY = 0.005
 _MOST_COPIES = 8  # of one Gaussian in one move; beyond, the alternating sum of equation 9 loses float32 digits
 
 
-def relocate(gaussians: Gaussians, key: PRNGKeyArray) -> tuple[Gaussians, Float[Array, "n"], Int[Array, ""]]:
+def relocate(
+    gaussians: Gaussians, key: PRNGKeyArray, errors: Float[Array, "n"] | None = None
+) -> tuple[Gaussians, Float[Array, "n"], Int[Array, ""]]:
     """Move every dead Gaussian onto a live one drawn by opacity; opacities and scales change to keep the picture.
 
     Args:
         gaussians: in training.
         key: random key.
+        errors: share of each Gaussian in the errors of the pictures, in any unit: half of the draws are by error, as
+            Rota Bulò et al. (2024) densify, and half by opacity. None: all by opacity.
 
     Returns:
         The Gaussians; 1 for Gaussians whose optimiser state stays valid and 0 for those that changed; and the number
@@ -36,7 +40,10 @@ def relocate(gaussians: Gaussians, key: PRNGKeyArray) -> tuple[Gaussians, Float[
     # without a live Gaussian there is no target
     dead &= ~jnp.all(dead)
     # `categorical` would draw a number for every pair of splats
-    target = jax.random.choice(key, opacities.shape[0], opacities.shape, p=jnp.where(dead, 0.0, opacities))
+    weights = jnp.where(dead, 0.0, opacities)
+    if errors is not None:
+        weights = weights / jnp.sum(weights) + _shares(jnp.where(dead, 0.0, errors))
+    target = jax.random.choice(key, opacities.shape[0], opacities.shape, p=weights)
     source = jnp.where(dead, target, jnp.arange(opacities.shape[0]))
     copies = jnp.minimum(jnp.zeros_like(source).at[source].add(1), _MOST_COPIES)[source]
     opacity, shrink = split_opacity(opacities[source], copies)
@@ -46,6 +53,12 @@ def relocate(gaussians: Gaussians, key: PRNGKeyArray) -> tuple[Gaussians, Float[
     log_scales = moved.log_scales + jnp.where(changed, jnp.log(shrink), 0.0)[:, None]
     moved = eqx.tree_at(lambda g: (g.logit_opacities, g.log_scales), moved, (logit, log_scales))
     return moved, jnp.where(changed, 0.0, 1.0), jnp.sum(dead)
+
+
+def _shares(values: Float[Array, "n"]) -> Float[Array, "n"]:
+    """Values that are not negative, divided by their sum; zeros stay zeros."""
+    total = jnp.sum(values)
+    return values / jnp.where(total > 0, total, 1.0)
 
 
 def split_opacity(opacity: Float[Array, "n"], copies: Int[Array, "n"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:

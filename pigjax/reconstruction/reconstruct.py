@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -25,21 +25,31 @@ from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError, StaleError
 from pigjax.core.extent import scene_extent
 from pigjax.core.metrics import psnr, ssim
-from pigjax.reconstruction.init import random_points, start_gaussians
+from pigjax.reconstruction.exposure import fit_gains, gains_of
+from pigjax.reconstruction.init import far_shell, random_points, start_gaussians
 from pigjax.reconstruction.train import (
     FitConfig,
     FitState,
     Photos,
+    corrected_cameras,
     count_at,
     grow,
+    halved,
+    halvings_at,
     optimizer_of,
     relocate_dead,
+    size_steps,
+    start_per_view,
     train_steps,
-    twist_of,
+    view_optimizer_of,
+    with_budget,
 )
 from pigjax.splat import Gaussians, render
 from pigjax.splatting.binning import shards_of
 from pigjax.splatting.sharding import replicate
+
+Cloud = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]  # positions [m] and colours (0 to 1)
+_LEAST_SHELL = 4  # points that a shell is worth making of
 
 
 class Progress(NamedTuple):
@@ -60,8 +70,13 @@ class Reconstruction:
     gaussians: Gaussians
     psnr: dict[str, float]  # per held-out view [dB]
     ssim: dict[str, float]
+    # per held-out view [dB], after three gains are fitted to the photo (`exposure.fit_gains`); empty without
+    # `exposure_rate`
+    corrected_psnr: dict[str, float]
     cameras: Camera  # of the training views, corrected if `pose_rate` > 0
     trained_on: tuple[str, ...]  # their names
+    # gains of red, green and blue of each training view, with `exposure_rate`
+    gains: Float[Array, "v 3"] | None = None
     history: list[Progress] = field(default_factory=list)
     relocated: int = 0
 
@@ -81,7 +96,7 @@ def reconstruct(
     views: io.Views,
     config: FitConfig = FitConfig(),
     *,
-    points: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]] | None = None,
+    points: Cloud | None = None,
     checkpoint: Path | None = None,
     previews: Path | None = None,
     callback: Callable[[Progress], None] | None = None,
@@ -105,25 +120,29 @@ def reconstruct(
 
     Raises:
         StaleError: the checkpoint was made from other photos, cameras, masks, points or settings; it names which.
-        InputError: no training views, too few points, or no masks where the settings need them.
+        InputError: no training views, too few points, no masks where the settings need them, or a far shell where
+            masks leave the background out.
     """
     # with a capacity, splats would be dropped silently
     config = replace(config, render=replace(config.render, capacity=None, differentiation="reverse"))
     if (config.object_id is not None or config.random_background) and views.masks is not None:
         views = views.masked  # a view without a mask says nothing of where the object is
     train, held_out = views.training, views.held_out
+    config = with_budget(config, train.cameras)
+    assert config.splats is not None
+    if config.shell and (config.object_id is not None or config.random_background):
+        raise InputError(f"FitConfig.shell = {config.shell}: masks leave the background out; leave it 0 with them.")
     if points is None:
         points = random_points(train.cameras, min(config.splats, 5000), seed=config.seed)
     extent = scene_extent(points[0], name="points").spread
-    pose_rate = optax.exponential_decay(config.pose_rate, config.steps, 0.1)
-    optimizers = optimizer_of(config, extent), optax.adam(pose_rate)
+    optimizers = optimizer_of(config, extent), view_optimizer_of(config)
     shards = shards_of(train.cameras, config.render)
 
     def start(count: int) -> FitState:
-        gaussians = start_gaussians(*points, count, config.sh_degree, seed=config.seed)
-        poses = jnp.zeros((len(train), 6)) if config.pose_rate else None
+        gaussians = _start(points, train, count, config)
+        per_view = start_per_view(len(train), config)
         zero = jnp.zeros((), jnp.int32)
-        return FitState(gaussians, optimizers[0].init(gaussians), poses, optimizers[1].init(poses), zero, zero)
+        return FitState(gaussians, optimizers[0].init(gaussians), per_view, optimizers[1].init(per_view), zero, zero)
 
     parts = provenance(views, config, points)
     state = start(count_at(0, config))
@@ -133,21 +152,25 @@ def reconstruct(
     if photos.mattes is not None and not photos.mattes.any():
         raise InputError(f"{_asked(config)}: no mask of the training views has any pixel of it.")
     scored = None if held_out is None else _scored(held_out, config)
-    state, photos, cameras = replicate((state, photos, train.cameras), shards)
-    result = Reconstruction(state.gaussians, {}, {}, train.cameras, train.names)
+    state = replicate(state, shards)
+    result = Reconstruction(state.gaussians, {}, {}, {}, train.cameras, train.names)
     begun = time.perf_counter()
+    size = None  # no photos are prepared yet
     while (step := int(state.step)) < config.steps:
+        if size != halvings_at(step, config):
+            size = halvings_at(step, config)
+            cameras, small = replicate(halved(train.cameras, photos, size), shards)
         if (count := count_at(step, config)) > len(state.gaussians):
-            state = grow(state, count, config)
+            state = grow(state, count, config, corrected_cameras(cameras, state, extent), small)
         stop = min(config.steps, _next_stop(step, config))
-        state, loss = train_steps(state, cameras, photos, config, optimizers, extent, jnp.asarray(stop - step))
+        state, loss = train_steps(state, cameras, small, config, optimizers, extent, jnp.asarray(stop - step))
         state = replicate(state, shards)
         if config.relocate_every and stop % config.relocate_every == 0 and stop <= config.relocate_until * config.steps:
-            state = relocate_dead(state, config)
+            state = relocate_dead(state, config, corrected_cameras(cameras, state, extent), small)
         psnrs: dict[str, float] = {}
         ssims: dict[str, float] = {}
         if stop % config.evaluate_every == 0 or stop == config.steps:
-            psnrs, ssims = _score(state.gaussians, scored, config)
+            psnrs, ssims, _ = _score(state.gaussians, scored, config)
             if checkpoint is not None:
                 io.save_pytree(checkpoint, state, parts=parts)
         if previews is not None and config.preview_every and stop % config.preview_every == 0:
@@ -156,15 +179,29 @@ def reconstruct(
         result.history.append(Progress(stop, float(loss), _mean(psnrs), _mean(ssims), len(state.gaussians), spent))
         if callback is not None:
             callback(result.history[-1])
-    psnrs, ssims = _score(state.gaussians, scored, config)
+    psnrs, ssims, corrected = _score(state.gaussians, scored, config)
     return replace(
         result,
         gaussians=state.gaussians,
         psnr=psnrs,
         ssim=ssims,
-        cameras=train.cameras if state.poses is None else train.cameras.nudged(twist_of(state.poses, extent)),
+        corrected_psnr=corrected,
+        cameras=corrected_cameras(train.cameras, state, extent),
+        gains=gains_of(state.per_view["exposures"]) if "exposures" in state.per_view else None,
         relocated=int(state.relocated),
     )
+
+
+def _start(points: Cloud, train: io.Views, count: int, config: FitConfig) -> Gaussians:
+    """Gaussians on the sparse points, and a share of them on a far shell where that is asked for."""
+    on_shell = int(config.shell * count)
+    on_shell = on_shell if on_shell >= _LEAST_SHELL else 0
+    near = start_gaussians(points[0], points[1], count - on_shell, config.sh_degree, seed=config.seed)
+    if not on_shell:
+        return near
+    shell, rgb = far_shell(train.cameras, points[0], train.images, on_shell, valid=train.valid)
+    far = start_gaussians(shell, rgb, on_shell, config.sh_degree, seed=config.seed)
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), near, far)
 
 
 def _mean(scores: dict[str, float]) -> float | None:
@@ -243,7 +280,7 @@ def _resume(
     """
     counts = sorted({count_at(step, config) for step in range(0, config.steps + 1, config.grow_every)})
     damage: InputError | None = None
-    for count in dict.fromkeys([*counts, config.splats]):
+    for count in counts:
         try:
             return io.load_pytree(checkpoint, start(count), parts=parts)
         except StaleError:
@@ -267,7 +304,9 @@ def _preview(path: Path, gaussians: Gaussians, views: io.Views, config: FitConfi
 
 def _next_stop(step: int, config: FitConfig) -> int:
     grows = config.grow_every if config.start_splats is not None else 0
-    return _next_multiple(step, config.relocate_every, config.evaluate_every, config.preview_every, grows, 50)
+    sizes = [start for start in size_steps(config) if start > step]
+    stop = _next_multiple(step, config.relocate_every, config.evaluate_every, config.preview_every, grows, 50)
+    return min([stop, *sizes])
 
 
 def _next_multiple(step: int, *periods: int) -> int:
@@ -276,13 +315,14 @@ def _next_multiple(step: int, *periods: int) -> int:
 
 def _score(
     gaussians: Gaussians, held_out: Scored | None, config: FitConfig
-) -> tuple[dict[str, float], dict[str, float]]:
-    """PSNR [dB] and SSIM of each held-out view by name."""
+) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
+    """PSNR [dB] and SSIM of each held-out view by name, and with exposures the PSNR [dB] after gains are fitted."""
     if held_out is None:
-        return {}, {}
+        return {}, {}, {}
     names, cameras, images, valid = held_out
-    psnrs, ssims = _score_views(gaussians, cameras, images, valid, config)
-    return dict(zip(names, map(float, psnrs))), dict(zip(names, map(float, ssims)))
+    scores = _score_views(gaussians, cameras, images, valid, config)
+    psnrs, ssims, corrected = (dict(zip(names, map(float, values))) for values in scores)
+    return psnrs, ssims, corrected
 
 
 @eqx.filter_jit
@@ -290,7 +330,12 @@ def _score_views(gaussians: Gaussians, cameras: Camera, images, valid, config: F
     def one(view):
         camera, image, counted = view
         rgb = render(gaussians, camera, config.render, background=config.background, outputs=("rgb",)).rgb
+        assert rgb is not None
+        corrected: Any = ()
+        if config.exposure_rate:
+            gained = jnp.clip(rgb * fit_gains(rgb, image, valid=counted), 0, 1)
+            corrected = psnr(gained, image, valid=counted)
         rgb = jnp.clip(rgb, 0, 1)
-        return psnr(rgb, image, valid=counted), ssim(rgb, image, valid=counted)
+        return psnr(rgb, image, valid=counted), ssim(rgb, image, valid=counted), corrected
 
     return lax.map(one, (cameras, images, valid))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -18,8 +19,12 @@ from pigjax.core.camera import Camera
 from pigjax.core.checks import LARGEST_WHOLE, Limits, check_fields, shown
 from pigjax.core.errors import InputError
 from pigjax.core.metrics import ssim
+from pigjax.reconstruction.exposure import gains_of
 from pigjax.reconstruction.mcmc import relocate, shake
-from pigjax.splat import Gaussians, RenderConfig, render
+from pigjax.splat import Gaussians, RenderConfig, backproject, render
+
+_PIXELS_A_SPLAT = 140
+_BUDGET = (1000, 1_000_000)
 
 
 class FitConfig(eqx.Module):
@@ -33,7 +38,8 @@ class FitConfig(eqx.Module):
     """
 
     steps: int = static_field(default=3000, limits=Limits(1, 100_000_000))
-    splats: int = static_field(default=15_000, limits=Limits(4, LARGEST_WHOLE))
+    # None: one for every 140 pixels of the training photos (`splat_budget`)
+    splats: int | None = static_field(default=None, limits=Limits(4, LARGEST_WHOLE))
     # number at the start, doubled every `grow_every` steps up to `splats`; None: `splats`
     start_splats: int | None = static_field(default=None, limits=Limits(4, LARGEST_WHOLE))
     # steps; with the default, counts from 2,000 reach 15,000 within half of the steps
@@ -47,6 +53,13 @@ class FitConfig(eqx.Module):
     random_background: bool = static_field(default=False)  # a new colour in each step outside of the masks
     # of the poses of the training cameras [rad, extents]; 0 keeps them
     pose_rate: float = static_field(default=0.0, limits=Limits(0, 1e3))
+    # of the logarithms of the gains of red, green and blue in each photo (`exposure`); 0 traces none
+    exposure_rate: float = static_field(default=0.0, limits=Limits(0, 1e3))
+    # of the splats on a sphere around the scene, for sky and background (`init.far_shell`); 0 makes none
+    shell: float = static_field(default=0.0, limits=Limits(0, 1, below=True))
+    # the photos are halved this often at the start, and doubled after equal parts of the steps up to `full_size_from`
+    halvings: int = static_field(default=0, limits=Limits(0, 8))
+    full_size_from: float = static_field(default=0.3, limits=Limits(0, 1))  # share of the steps
     # of the centres, times the extent of the points; decays to a hundredth
     means_rate: float = static_field(default=4e-4, limits=Limits(0, 1e3))
     # of the logarithms of the scales
@@ -60,6 +73,9 @@ class FitConfig(eqx.Module):
     band_every: int = static_field(default=500, limits=Limits(0, LARGEST_WHOLE))
     relocate_every: int = static_field(default=100, limits=Limits(0, LARGEST_WHOLE))  # steps; 0 never moves a splat
     relocate_until: float = static_field(default=0.8, limits=Limits(0, 1))  # share of the steps
+    # photos whose errors are measured before each relocation: half of the dead go to splats drawn by error instead of
+    # opacity, so that they reach regions that are poorly covered; 0: all are drawn by opacity
+    error_views: int = static_field(default=0, limits=Limits(0, LARGEST_WHOLE))
     # on the centres, times their rate, per squared extent; 0 traces none
     noise: float = static_field(default=200.0, limits=Limits(0, 1e9))
     # weight of the mean opacity in the loss, as in 3DGS-MCMC; 0 traces none
@@ -78,11 +94,13 @@ class FitConfig(eqx.Module):
         check_fields(self)
         if not isinstance(self.render, RenderConfig):
             raise InputError(f"FitConfig.render = {shown(self.render)}: must be a RenderConfig.")
-        if self.start_splats is not None and self.start_splats > self.splats:
+        if self.start_splats is None or self.splats is None:
+            return
+        if self.start_splats > self.splats:
             raise InputError(
                 f"FitConfig.start_splats = {self.start_splats}: must not be above splats = {self.splats}, its end."
             )
-        if self.start_splats is not None and (reached := count_at(self.steps - 1, self)) < self.splats:
+        if (reached := count_at(self.steps - 1, self)) < self.splats:
             raise InputError(
                 f"FitConfig.start_splats = {self.start_splats} doubles to {reached} of splats = {self.splats}"
                 f" within {self.steps} steps: lower grow_every = {self.grow_every}, or start with more."
@@ -102,14 +120,33 @@ class FitState(eqx.Module):
 
     gaussians: Gaussians
     optimizer: Any
-    poses: Float[Array, "v 6"] | None  # corrections of the training cameras
-    pose_optimizer: Any
+    # of each training photo: "poses" [v 6], corrections of its camera, and "exposures" [v 3], logarithms of its gains;
+    # only what is fitted
+    per_view: dict[str, Float[Array, "v _"]]
+    view_optimizer: Any
     step: Int[Array, ""]
     relocated: Int[Array, ""]
 
 
+def splat_budget(views: int, width: int, height: int) -> int:
+    """Number of splats for photos of this number and size: one for 140 pixels, between 1,000 and a million.
+
+    A scene whose photos hold more pixels shows more of the world, or shows it closer. 140 gives 15,000 splats for 32
+    photos of 256 x 256 pixels.
+    """
+    return int(np.clip(views * width * height // _PIXELS_A_SPLAT, *_BUDGET))
+
+
+def with_budget(config: FitConfig, cameras: Camera) -> FitConfig:
+    """Settings whose number of splats is a number: that of the settings, or the budget for these training views."""
+    if config.splats is not None:
+        return config
+    return replace(config, splats=splat_budget(len(cameras), cameras.width, cameras.height))
+
+
 def count_at(step: int, config: FitConfig) -> int:
-    """Number of splats from this step on."""
+    """Number of splats from this step on; `config.splats` must be given (`with_budget`)."""
+    assert config.splats is not None
     first = config.splats if config.start_splats is None else min(config.start_splats, config.splats)
     return min(config.splats, first * 2 ** min(step // config.grow_every, 40))
 
@@ -133,6 +170,21 @@ def optimizer_of(config: FitConfig, extent: float) -> optax.GradientTransformati
         {name: optax.adam(rate, eps=1e-15) for name, rate in rates.items()},
         lambda tree: jax.tree_util.tree_map_with_path(lambda path, _: path[0].name, tree),
     )
+
+
+def view_optimizer_of(config: FitConfig) -> optax.GradientTransformation:
+    """Adam for the corrections of single photos; rates decay to a tenth."""
+    rates = {"poses": config.pose_rate, "exposures": config.exposure_rate}
+    return optax.partition(
+        {name: optax.adam(optax.exponential_decay(rate, config.steps, 0.1)) for name, rate in rates.items()},
+        {name: name for name, rate in rates.items() if rate},
+    )
+
+
+def start_per_view(views: int, config: FitConfig) -> dict[str, Float[Array, "v _"]]:
+    """No correction of any photo, for those kinds of corrections that are fitted."""
+    sizes = {"poses": (6, config.pose_rate), "exposures": (3, config.exposure_rate)}
+    return {name: jnp.zeros((views, size)) for name, (size, rate) in sizes.items() if rate}
 
 
 def _band_rates(step: Int[Array, ""], config: FitConfig) -> Float[Array, "k 1"]:
@@ -173,39 +225,45 @@ def train_steps(state: FitState, cameras: Camera, photos: Photos, config: FitCon
             background = jax.random.uniform(jax.random.fold_in(key, 1), (3,))
 
         def loss(fitted):
-            gaussians, poses = fitted
-            twist = None if poses is None else twist_of(poses[view], extent)
+            gaussians, per_view = fitted
             photo = jax.tree.map(lambda array: array[view], photos)
-            return _loss((gaussians, twist), cameras[view], photo, background, config, extent)
+            camera = cameras[view]
+            if "poses" in per_view:
+                camera = camera.nudged(twist_of(per_view["poses"][view], extent))
+            gains = gains_of(per_view["exposures"])[view] if "exposures" in per_view else None
+            return _loss(gaussians, camera, gains, photo, background, config, extent)
 
-        value, (gradient, pose_gradient) = eqx.filter_value_and_grad(loss)((state.gaussians, state.poses))
+        value, (gradient, view_gradient) = eqx.filter_value_and_grad(loss)((state.gaussians, state.per_view))
         updates, moments = optimizers[0].update(gradient, state.optimizer, state.gaussians)
         updates = eqx.tree_at(lambda g: g.sh, updates, updates.sh * _band_rates(state.step, config))
         gaussians = optax.apply_updates(state.gaussians, updates)
         if config.noise:
             gaussians = shake(gaussians, key, noise_at(state.step, config, extent))
-        pose_updates, pose_moments = optimizers[1].update(pose_gradient, state.pose_optimizer, state.poses)
-        moved = (optax.apply_updates(state.poses, pose_updates), pose_moments)
+        view_updates, view_moments = optimizers[1].update(view_gradient, state.view_optimizer, state.per_view)
+        moved = (optax.apply_updates(state.per_view, view_updates), view_moments)
         visited = jnp.arange(views) == view
 
         def only_visited(new, old):
             # the momentum must not move a camera that this step did not see
             return jnp.where(visited[:, None], new, old) if new.ndim == 2 else new
 
-        poses, pose_moments = jax.tree.map(only_visited, moved, (state.poses, state.pose_optimizer))
-        return FitState(gaussians, moments, poses, pose_moments, state.step + 1, state.relocated), total + value
+        per_view, view_moments = jax.tree.map(only_visited, moved, (state.per_view, state.view_optimizer))
+        return FitState(gaussians, moments, per_view, view_moments, state.step + 1, state.relocated), total + value
 
     state, total = lax.fori_loop(0, count, one, (state, jnp.zeros(())))
     return state, total / count
 
 
-def _loss(fitted, camera: Camera, photo: Photos, background, config: FitConfig, extent: float):
-    gaussians, twist = fitted
-    camera = camera if twist is None else camera.nudged(twist)
-    frame = render(gaussians, camera, config.render, background=background, outputs=("rgb",))
-    assert frame.rgb is not None
+def _loss(gaussians: Gaussians, camera: Camera, gains, photo: Photos, background, config: FitConfig, extent: float):
+    if gains is None:
+        rgb = render(gaussians, camera, config.render, background=background, outputs=("rgb",)).rgb
+        assert rgb is not None
+    else:  # the grey level behind the splats is that of the photo, and has no exposure
+        frame = render(gaussians, camera, config.render, outputs=("rgb", "alpha"))
+        assert frame.rgb is not None
+        assert frame.alpha is not None
+        rgb = frame.rgb * gains + (1 - frame.alpha)[..., None] * background
     image = photo.images if photo.mattes is None else photo.images + (1 - photo.mattes) * background
-    rgb = frame.rgb
     if photo.valid is not None:
         rgb, image = (jnp.where(photo.valid[..., None], picture, 0.0) for picture in (rgb, image))
     loss = (1 - config.ssim_weight) * jnp.mean(jnp.abs(rgb - image))
@@ -216,16 +274,63 @@ def _loss(fitted, camera: Camera, photo: Photos, background, config: FitConfig, 
     return loss
 
 
+def halved(cameras: Camera, photos: Photos, times: int) -> tuple[Camera, Photos]:
+    """Views and photos at a size that is halved some times, no side below 16 pixels. Host.
+
+    A pixel of the small photos counts where all pixels below it do.
+    """
+    height, width = (max(side // 2**times, min(side, 16)) for side in (cameras.height, cameras.width))
+    if (height, width) == (cameras.height, cameras.width):
+        return cameras, photos
+
+    def small(images):
+        shape = (*images.shape[:1], height, width, *images.shape[3:])
+        return jax.image.resize(images.astype(photos.images.dtype), shape, "linear", antialias=True)
+
+    mattes = None if photos.mattes is None else small(photos.mattes)
+    valid = None if photos.valid is None else small(photos.valid) > 1 - 1e-3
+    return cameras.resized(width, height), Photos(small(photos.images), mattes, valid)
+
+
+def size_steps(config: FitConfig) -> list[int]:
+    """Steps from which the photos are one size larger than before."""
+    share = config.full_size_from * config.steps
+    return [math.ceil(share * (k + 1) / config.halvings) for k in range(config.halvings)]
+
+
+def halvings_at(step: int, config: FitConfig) -> int:
+    """How often the photos are halved in this step."""
+    return sum(step < start for start in size_steps(config))
+
+
+def corrected_cameras(cameras: Camera, state: FitState, extent: float) -> Camera:
+    """Cameras of the photos with the poses that were fitted."""
+    poses = state.per_view.get("poses")
+    return cameras if poses is None else cameras.nudged(twist_of(poses, extent))
+
+
 def twist_of(poses: Float[Array, "*v 6"], extent: float) -> Float[Array, "*v 6"]:
     """Pose corrections as `Camera.nudged` takes them; translations are learnt in units of the extent [m]."""
     return poses * jnp.asarray([1.0, 1.0, 1.0, extent, extent, extent])
 
 
 @eqx.filter_jit
-def relocate_dead(state: FitState, config: FitConfig) -> FitState:
-    """State with dead Gaussians relocated (`mcmc.relocate`) and the Adam moments of changed ones set to 0."""
+def relocate_dead(
+    state: FitState, config: FitConfig, cameras: Camera | None = None, photos: Photos | None = None
+) -> FitState:
+    """State with dead Gaussians relocated (`mcmc.relocate`) and the Adam moments of changed ones set to 0.
+
+    Args:
+        state: before.
+        config: settings.
+        cameras: training views as corrected, for relocation by error; None: by opacity alone.
+        photos: of these views.
+    """
     key = jax.random.fold_in(jax.random.key(config.seed + 2), state.step)
-    gaussians, keep, moved = relocate(state.gaussians, key)
+    errors = None
+    if cameras is not None and photos is not None and config.error_views:
+        errors = _errors(state, cameras, photos, config, jax.random.fold_in(key, 1))
+    gaussians, keep, moved = relocate(state.gaussians, key, errors)
     count = len(gaussians)
 
     def forget(moment):
@@ -237,8 +342,34 @@ def relocate_dead(state: FitState, config: FitConfig) -> FitState:
     return replace(state, gaussians=gaussians, optimizer=moments, relocated=state.relocated + moved)
 
 
-def grow(state: FitState, count: int, config: FitConfig) -> FitState:
-    """State with `count` Gaussians: dead ones are added and relocated at once. Their moments start from 0."""
+def _errors(state: FitState, cameras: Camera, photos: Photos, config: FitConfig, key) -> Float[Array, "n"]:
+    """Sum over some photos and their pixels of each Gaussian's alpha·T times the error of the pixel."""
+    views = photos.images.shape[0]
+    chosen = jax.random.choice(key, views, (min(config.error_views, views),), replace=False)
+    gains = gains_of(state.per_view["exposures"]) if "exposures" in state.per_view else None
+
+    def of_view(total, view):
+        photo = jax.tree.map(lambda array: array[view], photos)
+        frame = render(state.gaussians, cameras[view], config.render, outputs=("rgb", "alpha"))
+        assert frame.rgb is not None
+        assert frame.alpha is not None
+        rgb = frame.rgb if gains is None else frame.rgb * gains[view]
+        image = photo.images
+        if photo.mattes is None:
+            rgb = rgb + (1 - frame.alpha)[..., None] * config.background
+        error = jnp.mean(jnp.abs(rgb - image), -1, keepdims=True)
+        if photo.valid is not None:
+            error = jnp.where(photo.valid[..., None], error, 0.0)
+        return total + backproject(state.gaussians, cameras[view], error, config.render)[0][:, 0], None
+
+    return lax.scan(of_view, jnp.zeros(len(state.gaussians)), chosen)[0]
+
+
+def grow(state: FitState, count: int, config: FitConfig, cameras: Camera, photos: Photos) -> FitState:
+    """State with `count` Gaussians: dead ones are added and relocated at once. Their moments start from 0.
+
+    Cameras and photos are those of `relocate_dead`.
+    """
     old = len(state.gaussians)
 
     def longer(leaf):
@@ -249,4 +380,4 @@ def grow(state: FitState, count: int, config: FitConfig) -> FitState:
     gaussians, moments = jax.tree.map(longer, (state.gaussians, state.optimizer))
     dead = jnp.where(jnp.arange(count) < old, gaussians.logit_opacities, -10.0)
     gaussians = eqx.tree_at(lambda g: g.logit_opacities, gaussians, dead)
-    return relocate_dead(replace(state, gaussians=gaussians, optimizer=moments), config)
+    return relocate_dead(replace(state, gaussians=gaussians, optimizer=moments), config, cameras, photos)

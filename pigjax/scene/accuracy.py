@@ -17,7 +17,7 @@ class Level(NamedTuple):
 LEVELS: dict[str, Level] = {
     "draft": Level(1.5, {"simulation": {"cfl": 0.8}, "drawing": {"scale": 0.5, "alpha_min": 1 / 64}}),
     "standard": Level(1.0, {}),
-    "reference": Level(0.75, {"drawing": {"transmittance_min": 1e-6, "alpha_min": 1e-4}}),
+    "reference": Level(0.75, {"simulation": {"cfl": 0.4}, "drawing": {"transmittance_min": 1e-6, "alpha_min": 1e-4}}),
 }
 
 

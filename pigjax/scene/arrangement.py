@@ -1,4 +1,4 @@
-"""Objects of a scene where its file puts them: moved, turned, scaled, copied, removed, or from files of their own."""
+"""Objects of a scene as its file has them: filled, moved, turned, scaled, copied, removed, from files of their own."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from pigjax.core.extent import scene_extent
 from pigjax.core.gaussians import SH_CONSTANT
 from pigjax.core.placing import placed
 from pigjax.coupling.filling import lattice_step
+from pigjax.coupling.hidden import fill_hidden
 from pigjax.coupling.outliers import cut_outliers
 from pigjax.coupling.vessel import CLEAR, box_points, points_in_vessel
 from pigjax.mpm.colliders import Collider, SampledDistance
@@ -45,6 +46,7 @@ def arrange(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs
     Raises:
         SceneError: an object's name is that of a copy, or a volume has no place for matter.
     """
+    inputs, labels = _filled(scene, inputs, labels)
     if any(entry.is_placed for entry in scene.objects.values()):
         scene, inputs, labels = _placed(scene, inputs, labels)
     return with_volumes(scene, inputs, labels) if scene.volumes else (scene, inputs, labels)
@@ -85,6 +87,28 @@ def _placed(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs
     everything = jax.tree.map(lambda *columns: jnp.concatenate(columns), base, *parts)
     labels = appended(labels, [len(part) for part in parts], owners)
     return with_fields(scene, objects=objects), replace(inputs, gaussians=everything, ids=ids, arranged=True), labels
+
+
+def _filled(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Inputs, Labels]:
+    """Inputs and labels with the surfaces closed that objects hid which do not stay."""
+    hiding = [inputs.ids[name] for name, entry in scene.objects.items() if not entry.fixed]
+    eyes = None if inputs.views is None else np.asarray(inputs.views.training.cameras.position, np.float64)
+    for name, entry in scene.objects.items():
+        if not entry.fill:
+            continue
+        found = fill_hidden(
+            inputs.gaussians,
+            labels,
+            inputs.ids[name],
+            hidden_by=hiding,
+            up=axis_of(scene.input.up),
+            eyes=eyes,
+            name=joined("objects", name),
+        )
+        counts = {"added": found.added, "recoloured": found.recoloured}
+        inputs = replace(inputs, gaussians=found.gaussians, arranged=True, filled={**inputs.filled, name: counts})
+        labels = found.labels
+    return inputs, labels
 
 
 def with_volumes(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs, Labels]:

@@ -34,6 +34,7 @@ def health_record(particles: Particles, health: Health | None, gravity: Float[np
         "kinetic_energy": np.asarray((mass * (v**2).sum(1)).sum() / 2),
         "gravity_energy": np.asarray((mass * height).sum()),
         "momentum": (mass[:, None] * v).sum(0),
+        "mass": mass.sum(),
         **_deformation(np.asarray(particles.F_visual)),
     }
 
@@ -70,6 +71,7 @@ def summary(records: Mapping[int, Record]) -> dict[str, Any]:
         "kinetic_energy_J": energy["kinetic"],
         "gravity_energy_J": energy["gravity"],
         "momentum_kg_m_s": [row["momentum"].tolist() for row in everything],
+        "mass_kg": [float(row.get("mass", np.nan)) for row in everything],
         **{name: {word: _series(everything, f"{name}_{word}") for word in _WORDS} for name in _MATTER},
     }
 

@@ -37,7 +37,7 @@ from pigjax.objects.lifting import lift
 from pigjax.scene.advice import default_dx, remarks_on
 from pigjax.scene.forces import forces_of
 from pigjax.scene.framing import framing_camera
-from pigjax.scene.schema import INPUT_FILES, OF_DRAWING, CameraSpec, ClampSpec, Scene, SimulationSpec
+from pigjax.scene.schema import INPUT_FILES, OF_DRAWING, CameraSpec, ClampSpec, Scene
 from pigjax.scene.world import WorldSpec, axis_of, file_to_world, height_of, metres_of, placed_cameras
 from pigjax.segmentation import Labels, fill_unseen
 from pigjax.splat import Gaussians, RenderConfig
@@ -60,7 +60,8 @@ class Inputs:
     labels: Labels | None = None  # where the scale of the world needed them
     poured: dict[int, float] = field(default_factory=dict)  # volume of each particle of a `[volumes]` block, by id [m³]
     solids: tuple[float, dict[str, Collider]] | None = None  # still objects as colliders, and the spacing they are for
-    arranged: bool = False  # whether objects were placed, copied or removed
+    arranged: bool = False  # whether objects were placed, copied, removed or filled
+    filled: dict[str, dict[str, int]] = field(default_factory=dict)  # Gaussians "added" and "recoloured", by object
 
     @property
     def moved(self) -> bool:
@@ -316,7 +317,7 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels, *, gaussians_per_cel
         table=table,
         binding=binding if len(binding) else None,
         colliders=colliders,
-        contact=_contact(spec, len(moving)),
+        contact=_contact(scene, len(moving)),
         forces=forces_of(scene.forces, particles, {name: number for number, name in enumerate(moving)}),
         sleep=None if spec.sleep is None else Sleep(speed=spec.sleep),
         gravity=vector,
@@ -348,10 +349,9 @@ def clamp_params(spec: ClampSpec) -> ClampParams:
     )
 
 
-def _contact(spec: SimulationSpec, bodies: int) -> BodyContact | None:
-    if spec.contact_friction is None or bodies < 2:
-        return None
-    return BodyContact(bodies=bodies, friction=jnp.asarray(spec.contact_friction))
+def _contact(scene: Scene, bodies: int) -> BodyContact | None:
+    friction = scene.contact_friction
+    return None if friction is None else BodyContact(bodies=bodies, friction=jnp.asarray(friction))
 
 
 def still_solids(scene: Scene, inputs: Inputs, labels: Labels, dx: float) -> dict[str, Collider]:
@@ -370,7 +370,7 @@ def still_solids(scene: Scene, inputs: Inputs, labels: Labels, dx: float) -> dic
         if not entry.fixed:
             continue
         members = np.flatnonzero(object_id == inputs.ids[name])
-        own = jax.tree.map(lambda values, members=members: values[members], inputs.gaussians)
+        own = jax.tree.map(lambda values, members=members: jnp.asarray(np.asarray(values)[members]), inputs.gaussians)
         where, up = joined("objects", name), axis_of(scene.input.up)
         if entry.hollow:
             solids[name] = vessel_from_gaussians(own, spacing=dx / 2, up=up, friction=entry.friction, name=where)
@@ -411,8 +411,9 @@ def _without_buried(inputs: Inputs, labels: Labels, solids: dict[str, Collider],
     a collider could only be stuck.
     """
     for name, solid in solids.items():
-        buried = solid.distance(inputs.gaussians.means) < -0.25 * dx
-        labels = replace(labels, object_id=jnp.where(buried, inputs.ids[name], labels.object_id))
+        buried = solid.distances_of(inputs.gaussians.means) < -0.25 * dx
+        object_id = np.where(buried, inputs.ids[name], np.asarray(labels.object_id))
+        labels = replace(labels, object_id=jnp.asarray(object_id, jnp.int32))
     return labels
 
 

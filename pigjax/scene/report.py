@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -51,10 +52,10 @@ class RunReport:
     def stage(self, name: str) -> Iterator[None]:
         """Add the time spent inside to a stage."""
         spent = self.times.setdefault(name, StageTime())
-        compiling = [0.0]
+        compiling, thread = [0.0], threading.get_ident()
 
         def listen(event: str, duration_secs: float, **_: str | int) -> None:
-            if event in _COMPILE_EVENTS:
+            if event in _COMPILE_EVENTS and threading.get_ident() == thread:  # what other threads compile costs no time
                 compiling[0] += duration_secs
 
         jax.monitoring.register_event_duration_secs_listener(listen)

@@ -76,7 +76,7 @@ def left_out(scene: Scene, report: RunReport) -> list[str]:
     """What the run does not model, with the setting that would where there is one."""
     spec, moving = scene.simulation, sum(not entry.fixed for entry in scene.objects.values())
     found = []
-    if moving > 1 and spec.contact_friction is None:
+    if moving > 1 and scene.contact_friction is None:
         found.append(
             "Contact between objects: they share one velocity field and stick where they touch"
             " (simulation.contact_friction parts them)."
@@ -93,7 +93,10 @@ def left_out(scene: Scene, report: RunReport) -> list[str]:
     found.append(f"Light: {light}")
     if scene.clamp.mode == "fixed":
         found.append('The stretch of splats, which keep their rest shape (clamp.mode = "fixed").')
-    found.append("New splats: none is split or added, so places that no photo saw stay empty.")
+    if not any(entry.fill for entry in scene.objects.values()):
+        found.append(
+            "Places that no photo saw: they stay empty (objects.NAME.fill closes a fixed object's surface there)."
+        )
     if count := report.sizes.get("gaussians_without_particle"):
         found.append(f"Particles of {count} Gaussians, which are carried by their neighbours.")
     found.append("Elastic energy in the curves below.")

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -147,6 +150,8 @@ def _run(
     prediction = _predict(scene, inputs, plan, stages, report, planned)
     say(report.plan)
     told = say if planned is not None else None
+    own_wanted = any(entry.splats != "carried" for entry in scene.objects.values())
+    pictures = None if own_wanted else _Pictures.of(scene, inputs, plan)  # of own splats, they are not known yet
     states = _simulate(scene, plan, stages, out / "states", parts, key, report, tell, told, prediction)
     followed = None
     if frames := min(scene.output.error_frames, scene.simulation.frames):
@@ -156,22 +161,23 @@ def _run(
         with report.stage("simulate"):
             for _ in states:
                 pass
-    seen, drawn, liquids = inputs, plan, None
-    if any(entry.splats != "carried" for entry in scene.objects.values()):
+    seen, shown, liquids = inputs, plan, None
+    if own_wanted:
         with report.stage("splats"):
             tell("splats", 0, 1)
             names = chosen(scene, laws_of(scene, plan), partial(_was_torn, scene, inputs, rows, out / "states", key))
-            seen, drawn, own = with_own(scene, inputs, plan, names, stored=made, say=say)
+            seen, shown, own = with_own(scene, inputs, plan, names, stored=made, say=say)
             if names:
-                rows["gaussian"] = np.asarray(drawn.particles.gaussian)
-                _store(scene, seen, drawn, rows, out, key, own)
+                rows["gaussian"] = np.asarray(shown.particles.gaussian)
+                _store(scene, seen, shown, rows, out, key, own)
                 liquids = liquids_of(smooth_of(own), rows["object"], plan.particles.x, own["carrier"], plan.dx)
                 report.sizes["own_splats_of"] = {
-                    name: int(np.sum(np.asarray(drawn.labels.object_id) == inputs.ids[name])) for name in names
+                    name: int(np.sum(np.asarray(shown.labels.object_id) == inputs.ids[name])) for name in names
                 }
             tell("splats", 1, 1)
     with report.stage("draw"):
-        _draw(scene, seen, drawn, drawn.labels, out, key, report, tell, states, liquids)
+        pictures = pictures or _Pictures.of(scene, seen, shown)
+        _draw(scene, seen, shown, shown.labels, pictures, out, key, report, tell, states, liquids)
     if followed is not None:
         with report.stage("estimate"):
             tell("estimate", 0, 1)
@@ -283,6 +289,8 @@ def _describe(scene: Scene, inputs: Inputs, plan: Plan, labels: Labels, report: 
         "dx": plan.dx,
         "mass_kg": float(plan.particles.mass.sum()),
     }
+    if inputs.filled:
+        report.sizes["filled"] = inputs.filled
 
 
 def _particles_of(
@@ -394,11 +402,40 @@ def _checkpoint(path: Path, frame: int, particles: Particles, active: ActiveGrid
     io.save_pytree(path, (np.asarray(frame), particles, active.memory()), parts=parts)
 
 
+class _Pictures(NamedTuple):
+    """The cameras of all frames, and the program that poses and renders one, compiled beside the simulation."""
+
+    cameras: Camera
+    program: Future[Any]  # (gaussians, particles, binding, camera): picture, and largest stretch of each splat
+
+    @classmethod
+    def of(cls, scene: Scene, inputs: Inputs, plan: Plan) -> _Pictures:
+        """Begin to compile."""
+        matter = np.asarray(plan.particles.x)
+        cameras = make_cameras(scene, inputs, matter.mean(0), matter)
+        background, config = jnp.asarray(scene.camera.background), render_config(scene)
+
+        # everything large comes in as an argument: XLA would fold constants for minutes
+        @jax.jit
+        def pose_and_render(gaussians: Gaussians, particles: Particles, binding: Any, camera: Camera):
+            splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
+            frame = render(splats, camera, config, background=background, outputs=("rgb",))
+            longest = safe_norm(splats.factors, axis=1) / jnp.exp(gaussians.log_scales)  # of each axis, over rest
+            return jnp.clip(frame.rgb, 0, 1), longest.max(1)
+
+        traced = pose_and_render.lower(inputs.gaussians, plan.particles, plan.binding, cameras[0])
+        compiler = ThreadPoolExecutor(1)
+        program = compiler.submit(traced.compile)
+        compiler.shutdown(wait=False)
+        return cls(cameras, program)
+
+
 def _draw(
     scene: Scene,
     inputs: Inputs,
     plan: Plan,
     labels: Labels,
+    drawn: _Pictures,
     out: Path,
     key: str,
     report: RunReport,
@@ -408,24 +445,21 @@ def _draw(
 ) -> None:
     """Pose and render each saved state, once `states` says that it is there; remove it where it is not to be kept."""
     frames, gaussians = scene.simulation.frames, inputs.gaussians
-    matter = np.asarray(plan.particles.x)
-    cameras = make_cameras(scene, inputs, matter.mean(0), matter)
-    background = jnp.asarray(scene.camera.background)
-    config = render_config(scene)
-
-    # everything large comes in as an argument: XLA would fold constants for minutes
-    @jax.jit
-    def pose_and_render(gaussians: Gaussians, particles: Particles, binding, camera: Camera):
-        splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
-        frame = render(splats, camera, config, background=background, outputs=("rgb",))
-        longest = safe_norm(splats.factors, axis=1) / jnp.exp(gaussians.log_scales)  # of each axis, relative to rest
-        return jnp.clip(frame.rgb, 0, 1), longest.max(1)
+    cameras = drawn.cameras
 
     def draw(frame: int) -> tuple[jax.Array, jax.Array]:
         state = io.load_state(out / "states", frame, signature=key)
-        particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, (state["x"], state["F_visual"]))
+        there = tuple(np.asarray(state[name], plan.particles.x.dtype) for name in ("x", "F_visual"))
+        particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, there)
         shown, particles = (gaussians, particles) if liquids is None else liquids(gaussians, particles)
-        return pose_and_render(shown, particles, plan.binding, cameras[frame])
+        return program()(shown, particles, plan.binding, cameras[frame])
+
+    def program() -> Any:
+        """The compiled program; time spent waiting for it counts as compiling."""
+        begun = time.perf_counter()
+        compiled = drawn.program.result()
+        report.times["draw"].compile += time.perf_counter() - begun
+        return compiled
 
     sheet_frames = np.unique(np.linspace(0, frames, _SHEET_FRAMES).round().astype(int))
     sheet: list[np.ndarray] = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -111,6 +113,7 @@ class RenderConfig(eqx.Module):
             )
 
 
+@partial(jax.jit, inline=True)
 def gaussian_factors(gaussians: Gaussians) -> Float[Array, "n 3 3"]:
     """Factors M = R S of the covariances M Mᵀ [m] (Kerbl et al. 2023, equation 6)."""
     return quat_to_matrix(gaussians.quats) * jnp.exp(gaussians.log_scales)[:, None, :]

@@ -1,5 +1,6 @@
 """A simulation on fitted boxes, on several devices or in a batch is the simulation on the whole grid."""
 
+import warnings
 from functools import partial
 
 import equinox as eqx
@@ -11,7 +12,7 @@ import pytest
 from pigjax.core.errors import InputError
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, active_grid, fit_grid, make_particles, vast_grid
-from pigjax.mpm.active_grid import ActiveGrid, box_for
+from pigjax.mpm.active_grid import ActiveGrid, box_for, choose_box
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.materials import Material, material_table, preset
@@ -185,6 +186,7 @@ def test_a_box_holds_the_motion_that_it_was_sized_for_and_is_none_where_it_would
     vast = Grid(jnp.zeros(3), jnp.asarray(DX), (64, 64, 64))
     box = box_for([(still, path, 0.04, (0.0, 0.0, 0.0))], ELASTIC, vast)
     assert max(box) < 32
+    assert choose_box(still, path, vast, ELASTIC, frame_dt=0.04, gravity=(0.0, 0.0, 0.0)) == box
     boxed, _, health = jax.jit(lambda still: run(still, config=SimConfig(substeps=80, devices=1, box=box)))(still)
     assert int(health.escaped) == 0
     assert float(jnp.abs(path.x[0] - still.x).max()) > 3 * DX  # hit in the first frame
@@ -225,6 +227,16 @@ def test_a_stopped_rollout_gives_back_its_last_good_frame(traced):
     np.testing.assert_array_equal(end.x, path.x[bad - 1])
     np.testing.assert_array_equal(path.x[bad:], np.broadcast_to(path.x[bad - 1], path.x[bad:].shape))
     assert np.isfinite(end.F).all()
+
+
+@pytest.mark.parametrize(("sides", "box", "warned"), [(48, None, True), (48, (16, 16, 16), False), (16, None, False)])
+def test_a_traced_rollout_over_empty_nodes_names_the_remedy(sides, box, warned):
+    grid, config = Grid(jnp.zeros(3), jnp.asarray(DX), (sides, sides, sides)), SimConfig(substeps=1, box=box)
+    particles = two_cubes()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        jax.eval_shape(lambda p: rollout(p, grid, TABLE, config, frames=1, **STEPS)[0].x, particles)
+    assert [f"all {48**3} nodes" in str(w.message) for w in caught if "choose_box" in str(w.message)] == [True] * warned
 
 
 def test_choices_of_devices_are_checked():

@@ -42,7 +42,7 @@ def test_standard_is_what_a_scene_without_the_word_is(values):
     plain, named = scene_of(values), scene_from({**values, "accuracy": "standard"}, folder=EXAMPLE.parent)
     assert plain == named == scene_of(values, accuracy="standard")
     assert plain.simulation.dx == values["simulation"]["dx"]
-    assert (plain.simulation.cfl, plain.simulation.kernel, plain.simulation.particles_per_cell) == (0.4, "quadratic", 8)
+    assert (plain.simulation.cfl, plain.simulation.kernel, plain.simulation.particles_per_cell) == (0.6, "quadratic", 8)
     inputs = read_inputs(plain)
     assert provenance(plain, inputs) == provenance(named, inputs)
     config = render_config(plain)

@@ -26,6 +26,7 @@ from pigjax.core.errors import InputError
 from pigjax.core.linalg import quat_multiply, quat_to_matrix, safe_norm, safe_normalize
 
 MODES = ("sticky", "slip", "separate")
+_TOGETHER = 16384  # points of `distances_of` at once
 Points = Float[Array, "*n 3"]
 Scalar = Float[Array, ""]
 Time = Float[Array, ""] | float
@@ -130,6 +131,17 @@ class Collider(eqx.Module):
         """Signed distance of points [m] from the surface a time [s] from now, negative inside [m]."""
         return self.shape_distance(self._to_shape(points, time))
 
+    def distances_of(self, points: Any) -> Float[np.ndarray, "n"]:
+        """`distance` of known points [n, 3] at the start [m] (host): one compilation, whatever their number.
+
+        The same points get the same distances to the bit, however many others are asked for.
+        """
+        points = np.asarray(points)
+        blocks = [points[k : k + _TOGETHER] for k in range(0, len(points), _TOGETHER)]
+        padded = [np.pad(block, ((0, _TOGETHER - len(block)), (0, 0)), "edge") for block in blocks]
+        found = [np.asarray(_distance(self, jnp.asarray(block))) for block in padded]
+        return np.concatenate([values[: len(block)] for values, block in zip(found, blocks)] or [np.zeros(0)])
+
     def normals(self, points: Points, time: Time = 0.0) -> Points:
         """Outward unit normal: the direction in which the distance grows; zero where there is none, as at a centre."""
         return self._distance_and_normals(points, time)[1]
@@ -225,6 +237,11 @@ class Collider(eqx.Module):
             return self.velocity
         spin = jnp.cross(self.angular_velocity, points - self._pivot_at(time))
         return spin if self.velocity is None else self.velocity + spin
+
+
+@jax.jit
+def _distance(collider: Collider, points: Points) -> Float[Array, "*n"]:
+    return collider.distance(points)
 
 
 def has_direction(vector: np.ndarray) -> Any:
