@@ -226,7 +226,7 @@ def surface_samples(shell: Shell, spacing: float) -> Float[np.ndarray, "s 3"]:
         spacing: edge of a voxel [m].
     """
     kept = _surface_members(shell)
-    samples = _disc_samples(shell, kept, spacing)
+    samples = disc_samples(shell, kept, spacing)
     _, owner, counts = np.unique(np.floor(samples / spacing), axis=0, return_inverse=True, return_counts=True)
     return np.stack([np.bincount(owner.ravel(), samples[:, i]) for i in range(3)], 1) / counts[:, None]
 
