@@ -60,6 +60,7 @@ from pigjax.splat import (
     required_capacity,
     surface_depth,
 )
+from pigjax.splatting.shadows import Light, cast_shadows, light_transmittance
 from pigjax.study import Experiment, experiment, load_study, sweep_study, tune_study
 from pigjax.study.optimize import Bounds, Table, fit, load_table, search, sweep
 
@@ -85,6 +86,7 @@ __all__ = [
     "Impulse",
     "InputError",
     "Labels",
+    "Light",
     "Material",
     "MaterialTable",
     "MissingFileError",
@@ -114,6 +116,7 @@ __all__ = [
     "at_frame",
     "bind",
     "boundary_iou",
+    "cast_shadows",
     "choose_box",
     "choose_integrator",
     "choose_substeps",
@@ -138,6 +141,7 @@ __all__ = [
     "hole_mask",
     "interpolate_path",
     "lift_masks",
+    "light_transmittance",
     "load_dataset",
     "load_gaussians",
     "load_masks",

@@ -470,12 +470,12 @@ def _camera_of_view(spec: CameraSpec, views: io.Views | None) -> Camera:
 
 
 def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
-    """Parts that the simulated states depend on; the camera, the clamp and the video do not count.
+    """Parts that the simulated states depend on; the camera, the clamp, the light and the video do not count.
 
     Nor does the name of the accuracy count, but the values that it set do; files count by their content.
     """
     settings: dict[str, Any] = msgspec.to_builtins(scene)
-    for name in ("accuracy", "camera", "clamp", "drawing", "folder", "output"):
+    for name in ("accuracy", "camera", "clamp", "drawing", "folder", "light", "output"):
         settings.pop(name)
     if scene.output.compress_states:
         settings["output"] = {"compress_states": True}

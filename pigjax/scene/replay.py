@@ -27,6 +27,7 @@ from pigjax.scene.schema import Scene, load_scene
 from pigjax.scene.world import axis_of
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, Splats
+from pigjax.splatting.shadows import Light, cast_shadows, light_transmittance
 
 SCENE_FILE = "scene.toml"  # settings of the run, in its folder
 COLLIDER_FILE = "colliders.npz"  # sampled distances of still objects
@@ -146,7 +147,19 @@ class Run:
         Raises:
             MissingFileError: the frame has no state.
         """
-        return _pose(self.gaussians, self.particles(frame), self.clamp, self.binding, self.mode)
+        splats = _pose(self.gaussians, self.particles(frame), self.clamp, self.binding, self.mode)
+        return splats if self.scene.light is None else self._shaded(splats, self.scene.light.to_light())
+
+    def _shaded(self, splats: Splats, light: Light) -> Splats:
+        casts = jnp.asarray(self.moving)
+        reached = light_transmittance(splats, casts, light)
+        return cast_shadows(splats, casts, light, reached, self._lit_at_rest)
+
+    @cached_property
+    def _lit_at_rest(self) -> Float[Array, "n"]:
+        assert self.scene.light is not None
+        splats = _pose(self.gaussians, self.particles(self.frames[0]), self.clamp, self.binding, self.mode)
+        return light_transmittance(splats, jnp.asarray(self.moving), self.scene.light.to_light())
 
     @cached_property
     def moving(self) -> np.ndarray:

@@ -43,7 +43,8 @@ from pigjax.scene.schema import Scene, values_of
 from pigjax.scene.stages import Stage, simulate_stages, stages_of
 from pigjax.scene.world import described
 from pigjax.segmentation import Labels, pixel_ids
-from pigjax.splat import Gaussians, render
+from pigjax.splat import Gaussians, RenderConfig, Splats, render
+from pigjax.splatting.shadows import Light, cast_shadows, light_transmittance
 
 _SHEET_FRAMES = 12
 _FILES = (
@@ -355,11 +356,43 @@ def _checkpoint(path: Path, frame: int, particles: Particles, active: ActiveGrid
     io.save_pytree(path, (np.asarray(frame), particles, active.memory()), parts=parts)
 
 
+def shaded_picture(
+    gaussians: Gaussians,
+    splats: Splats,
+    camera: Camera,
+    shade: tuple[jax.Array, Light, jax.Array, jax.Array] | None,
+    config: RenderConfig,
+    background: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Picture of a frame in [0, 1], and the greatest stretch of each splat relative to rest.
+
+    Args:
+        gaussians: at rest.
+        splats: posed.
+        camera: of the frame.
+        shade: arguments of `cast_shadows` after the splats; None: no light, and nothing of it is traced.
+        config: of the renderer.
+        background: colour behind the splats.
+    """
+    if shade is not None:
+        splats = cast_shadows(splats, *shade)
+    frame = render(splats, camera, config, background=background, outputs=("rgb",))
+    longest = safe_norm(splats.factors, axis=1) / jnp.exp(gaussians.log_scales)  # of each axis
+    return jnp.clip(frame.rgb, 0, 1), longest.max(1)
+
+
+def _moving(scene: Scene, inputs: Inputs, labels: Labels) -> np.ndarray:
+    """Which Gaussians belong to objects that move [n]."""
+    return np.isin(np.asarray(labels.object_id), [inputs.ids[n] for n, e in scene.objects.items() if not e.fixed])
+
+
 class _Pictures(NamedTuple):
     """The cameras of all frames, and the program that poses and renders one, compiled beside the simulation."""
 
     cameras: Camera
-    program: Future[Any]  # (gaussians, particles, binding, camera): picture, and largest stretch of each splat
+    program: Future[Any]  # (gaussians, particles, binding, camera, shade): picture, largest stretch of each splat
+    lit: Callable[..., jax.Array] | None  # (gaussians, particles, binding, casts, light): transmittance
+    shade: tuple[jax.Array, Light, jax.Array, jax.Array] | None  # of `shaded_picture`, at rest
 
     @classmethod
     def of(cls, scene: Scene, inputs: Inputs, plan: Plan) -> _Pictures:
@@ -367,20 +400,27 @@ class _Pictures(NamedTuple):
         matter = np.asarray(plan.particles.x)
         cameras = make_cameras(scene, inputs, matter.mean(0), matter)
         background, config = jnp.asarray(scene.camera.background), render_config(scene)
+        lit, shade = None, None
+        if scene.light is not None:
+            ones = jnp.ones(len(inputs.gaussians), inputs.gaussians.means.dtype)
+            shade = jnp.asarray(_moving(scene, inputs, plan.labels)), scene.light.to_light(), ones, ones
+
+            @jax.jit
+            def lit(gaussians: Gaussians, particles: Particles, binding: Any, *lights: Any) -> jax.Array:
+                splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
+                return light_transmittance(splats, *lights)
 
         # everything large comes in as an argument: XLA would fold constants for minutes
         @jax.jit
-        def pose_and_render(gaussians: Gaussians, particles: Particles, binding: Any, camera: Camera):
+        def pose_and_render(gaussians: Gaussians, particles: Particles, binding: Any, camera: Camera, shade: Any):
             splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
-            frame = render(splats, camera, config, background=background, outputs=("rgb",))
-            longest = safe_norm(splats.factors, axis=1) / jnp.exp(gaussians.log_scales)  # of each axis, over rest
-            return jnp.clip(frame.rgb, 0, 1), longest.max(1)
+            return shaded_picture(gaussians, splats, camera, shade, config, background)
 
-        traced = pose_and_render.lower(inputs.gaussians, plan.particles, plan.binding, cameras[0])
+        traced = pose_and_render.lower(inputs.gaussians, plan.particles, plan.binding, cameras[0], shade)
         compiler = ThreadPoolExecutor(1)
         program = compiler.submit(traced.compile)
         compiler.shutdown(wait=False)
-        return cls(cameras, program)
+        return cls(cameras, program, lit, shade)
 
 
 def _draw(
@@ -397,13 +437,20 @@ def _draw(
 ) -> None:
     """Pose and render each saved state, once `states` says that it is there; remove it where it is not to be kept."""
     frames, gaussians = scene.simulation.frames, inputs.gaussians
-    cameras = drawn.cameras
+    cameras, at_rest = drawn.cameras, None
+    moving = _moving(scene, inputs, labels)
 
     def draw(frame: int) -> tuple[jax.Array, jax.Array]:
+        nonlocal at_rest
         state = io.load_state(out / "states", frame, signature=key)
         there = tuple(np.asarray(state[name], plan.particles.x.dtype) for name in ("x", "F_visual"))
         particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, there)
-        return program()(gaussians, particles, plan.binding, cameras[frame])
+        shade = drawn.shade
+        if shade is not None and drawn.lit is not None:
+            reached = drawn.lit(gaussians, particles, plan.binding, *shade[:2])
+            at_rest = reached if at_rest is None else at_rest  # the first frame that is drawn is the rest state
+            shade = *shade[:2], reached, at_rest
+        return program()(gaussians, particles, plan.binding, cameras[frame], shade)
 
     def program() -> Any:
         """The compiled program; time spent waiting for it counts as compiling."""
@@ -414,7 +461,6 @@ def _draw(
 
     sheet_frames = np.unique(np.linspace(0, frames, _SHEET_FRAMES).round().astype(int))
     sheet: list[np.ndarray] = []
-    moving = np.isin(np.asarray(labels.object_id), [inputs.ids[n] for n, e in scene.objects.items() if not e.fixed])
     stretches: dict[str, list[float]] = {"median": [], "99 of 100 below": [], "most": []}
 
     every, within = scene.output.states_every, report.times["draw"]
