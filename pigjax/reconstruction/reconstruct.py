@@ -120,9 +120,14 @@ def reconstruct(
 
     Raises:
         StaleError: the checkpoint was made from other photos, cameras, masks, points or settings; it names which.
-        InputError: no training views, too few points, no masks where the settings need them, or a far shell where
-            masks leave the background out.
+        InputError: no training views, too few points, a photo that is not finite, no masks where the settings need
+            them, or a far shell where masks leave the background out.
     """
+    for name, photo in zip(views.names, views.images):
+        if not np.isfinite(photo).all():
+            raise InputError(
+                f"photo {name!r} holds NaN or infinity; give finite values in 0..1, or leave the view out."
+            )
     # with a capacity, splats would be dropped silently
     config = replace(config, render=replace(config.render, capacity=None, differentiation="reverse"))
     if (config.object_id is not None or config.random_background) and views.masks is not None:
