@@ -152,7 +152,7 @@ def reconstruct(
         poses = dict(zip(result.trained_on, result.cameras.world_to_cam.tolist()))
         io.write_json(out / "poses.json", {"world_to_cam": poses})
     io.write_json(out / "report.json", {"psnr": result.psnr, "ssim": result.ssim, "mean_psnr": result.mean_psnr,
-                                        "corrected_psnr": result.corrected_psnr,
+                                        "corrected_psnr": result.corrected_psnr, "relocated": result.relocated,
                                         "history": [step._asdict() for step in result.history]})  # fmt: skip
     table = Table("held-out view", "PSNR dB", "SSIM")
     for name in result.psnr:
