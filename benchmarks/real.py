@@ -24,7 +24,7 @@ from pigjax import (
     render,
     save_ply,
 )
-from pigjax.reconstruction.train import with_budget
+from pigjax.reconstruction.train import for_capture
 
 COLUMNS = (
     "capture", "settings", "photos", "size [px]", "splats", "steps", "PSNR [dB]", "least", "gains fitted", "training",
@@ -34,6 +34,7 @@ COLUMNS = (
 SWITCHES = {
     "none": {},
     "exposure": {"exposure_rate": 5e-3},
+    "no-shell": {"shell": 0.0},
     "shell": {"shell": 0.1},
     "sizes": {"halvings": 2},
     "antialias": {"render": {"antialias": True}},
@@ -90,7 +91,7 @@ def worker(folder: str, size: str, steps: str, splats: str, switch: str, out: st
     masks = (path / "object_mask").is_dir() or None
     views = load_views(path, masks=masks, missing_masks="abstain", max_size=int(size))
     points = load_points(views.points_path) if views.points_path else None
-    config = _config(int(steps), int(splats) if splats else None, switch, views)
+    config = _config(int(steps), int(splats) if splats else None, switch, views, None if points is None else points[0])
     begun, worked = time.perf_counter(), time.process_time()
     result = reconstruct(views, config, points=points)
     begun, worked = time.perf_counter() - begun, time.process_time() - worked
@@ -107,11 +108,11 @@ def worker(folder: str, size: str, steps: str, splats: str, switch: str, out: st
     print(row(*cells))
 
 
-def _config(steps: int, splats: int | None, switch: str, views: Views) -> FitConfig:
+def _config(steps: int, splats: int | None, switch: str, views: Views, points=None) -> FitConfig:
     """Settings of a run; growth is given in shares."""
     changes = dict(SWITCHES[switch])
     drawing = RenderConfig(bands=jax.local_device_count(), **changes.pop("render", {}))
-    config = with_budget(FitConfig(steps=steps, splats=splats, render=drawing), views.training.cameras)
+    config = for_capture(FitConfig(steps=steps, splats=splats, render=drawing), views.training.cameras, points)
     if "start_splats" in changes:
         changes["start_splats"] = max(int(changes["start_splats"] * config.splats), 4)
         changes["grow_every"] = max(int(changes["grow_every"] * steps), 1)
