@@ -42,7 +42,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import is_known
+from pigjax.core.arrays import is_compiling, is_known
 from pigjax.core.errors import InputError
 from pigjax.core.regions import Region
 from pigjax.mpm import Grid, Health, Particles, SimConfig, StepHealth, Trajectory
@@ -116,11 +116,12 @@ def step(
     """
     _check_table(particles, table)
     _check_contact(particles, config, contact)
+    _check_rigid(particles, table, config, contact)
     check_forces(forces, len(particles))
     check_gravity(gravity)
     if is_known(dt) and not 0 <= float(dt) < math.inf:
         raise InputError(f"dt = {float(dt)}: a step must be >= 0 s, and finite.")
-    if is_known(particles, grid, table, dt, gravity, colliders, contact, pins, forces):
+    if is_known(particles, grid, table, dt, gravity, colliders, contact, pins, forces) and not is_compiling():
         if config.integrator == "auto":
             explicit = replace(config, integrator="explicit")
             is_stable = float(dt) <= longest_step(float(dt), particles, grid, table, explicit, colliders)[0]
@@ -183,10 +184,11 @@ def rollout(
     """
     _check_table(particles, table)
     _check_contact(particles, config, contact)
+    _check_rigid(particles, table, config, contact)
     check_forces(forces, len(particles))
     check_steps(frames, frame_dt, gravity)
     shared = (particles, grid, table, frame_dt, gravity, colliders, contact, pins, forces)
-    if not is_known(shared):
+    if not is_known(shared) or is_compiling():
         if sleep is not None:
             raise InputError(
                 "rollout is traced by jit, grad or vmap, where it cannot be decided who sleeps: give sleep=None there."
@@ -292,6 +294,26 @@ def _check_table(particles: Particles, table: MaterialTable) -> None:
         raise InputError(
             f"The material table has {len(table)} rows, the particles were made for one of {len(particles.counts)}."
         )
+
+
+def _check_rigid(particles: Particles, table: MaterialTable, config: SimConfig, contact: BodyContact | None) -> None:
+    """Rigid matter takes explicit steps, and a grid of its own wherever there is other matter."""
+    rigid = sum(count for count, law in zip(particles.counts, table.laws) if law == "rigid")
+    if not rigid:
+        return
+    if (rule := broken_by(config.integrator)) is not None:
+        raise InputError(f"SimConfig.integrator = {config.integrator!r}: {rule}, which rigid matter takes, too.")
+    one = not is_known(particles.body) or len(np.unique(np.asarray(particles.body))) == 1
+    if contact is None and (rigid < len(particles) or not one):
+        raise InputError(
+            "contact = None: a rigid body beside other matter needs a grid of its own; number the bodies by"
+            " make_particles(body=...) and give contact=BodyContact(bodies=...)."
+        )
+    if is_known(particles.body, particles.material):
+        body, law = np.asarray(particles.body), np.asarray([law == "rigid" for law in table.laws])
+        own = law[np.asarray(particles.material)]
+        if (mixed := np.intersect1d(body[own], body[~own])).size:
+            raise InputError(f"Particles.body = {mixed[0]}: it is rigid in part; give the rest a body of its own.")
 
 
 def _check_contact(particles: Particles, config: SimConfig, contact: BodyContact | None) -> None:

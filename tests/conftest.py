@@ -14,7 +14,6 @@ from jaxtyping import install_import_hook
 
 if os.environ.get("PIGJAX_CHECK_SHAPES", "0") != "0":  # a fifth of the time of a run
     hook = install_import_hook("pigjax", "beartype.beartype")
-os.environ.setdefault("PIGJAX_SHORT", "1")  # notebooks run in their short form
 
 # Compiles in half the processor time, to code that runs slower: tests and short notebooks, but for the slow ones,
 # compile far more than they compute. Commands that tests start are compiled as users' are.

@@ -8,7 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import ball
 
+from pigjax.core.camera import look_at
 from pigjax.core.regions import HalfSpace
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, group_by_law, make_particles
@@ -16,6 +18,10 @@ from pigjax.mpm.colliders import Plane
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.forces import ForceField, Spring, Wind
 from pigjax.mpm.materials import LAWS, Material, Parameters, material_table, respond
+from pigjax.scene.run import shaded_picture
+from pigjax.splat import RenderConfig
+from pigjax.splatting.shadows import Light
+from pigjax.splatting.types import as_splats
 
 DX = 1 / 8
 DOMAIN = Grid(jnp.zeros(3), jnp.asarray(DX), (10, 11, 12))
@@ -25,6 +31,7 @@ NUMBERS = {  # in the order of LAWS, what each law reads
     "neo_hookean": set(),
     "stvk_hencky": set(),
     "fibres": {"fibre_stiffness", "fibre_azimuth", "fibre_elevation"},
+    "tearing_neo_hookean": {"tearing_stretch"},
     "von_mises": {"yield_stress", "hardening_modulus", "residual_stress"},
     "plasticine": {"yield_stress", "hardening_modulus", "residual_stress"},
     "drucker_prager": {"friction_angle", "cohesion"},
@@ -37,6 +44,7 @@ FLOOR = {"point": jnp.asarray([0.0, 0.0, 0.4]), "normal": jnp.asarray([0.0, 0.0,
 
 def material(law, **numbers):
     given = {"yield_stress": 1e3, "friction_angle": 0.6, "viscosity": 1.0, "bulk_modulus": 1e4, "fibre_stiffness": 1e4}
+    given["tearing_stretch"] = 1.2
     own = {name: given[name] for name in NUMBERS[law] if name in given}
     return Material(law, **{**ELASTIC, **own, **numbers})
 
@@ -117,7 +125,7 @@ def test_an_option_at_its_off_value_changes_nothing(plain, off):
 
 def test_numbers_that_no_law_present_reads_change_nothing(plain):
     """Viscosity, hardening, fibres and the rest, given to elastic matter: the same program, for other values."""
-    foreign = {name: 0.5 for names in NUMBERS.values() for name in names}
+    foreign = {name: 0.5 for names in NUMBERS.values() for name in names} | {"tearing_stretch": 1.5}
     assert text(traced([material("neo_hookean", **foreign)])) == text(plain)
 
 
@@ -143,6 +151,7 @@ SIGNS = {
     "drucker_prager": (lambda: traced([material("drucker_prager")]), lambda p: primitives(p)["tan"] > 0),
     "von_mises": (lambda: traced([material("von_mises")]), lambda p: primitives(p)["exp"] > 0),
     "foam": (lambda: traced([material("foam")]), lambda p: primitives(p)["pow"] > 0),
+    "rigid bodies": (lambda: traced([Material("rigid", density=1e3)]), lambda p: primitives(p)["sin"] > 0),
     "gusts": (lambda: traced(forces=(Wind((1.0, 0, 0), 1.0, gusts=1.0),)), lambda p: primitives(p)["cos"] > 0),
 }
 
@@ -160,6 +169,12 @@ def test_laws_of_the_table_without_particles_are_not_traced(plain):
     for law in ("fibres", "fluid", "drucker_prager", "von_mises", "foam"):
         assert not SIGNS[law][1](program), law
     assert in_steps(program) == in_steps(plain)
+
+
+def test_matter_that_does_not_tear_pays_nothing_for_it(plain):
+    torn, whole = material("tearing_neo_hookean"), material("neo_hookean")
+    assert in_steps(traced([torn])).total() > in_steps(plain).total()
+    assert in_steps(traced([whole, torn])) == in_steps(plain)
 
 
 def test_colliders_at_rest_are_found_once_and_moving_ones_in_each_step(plain):
@@ -198,3 +213,19 @@ def test_matter_carries_only_the_state_that_its_law_has():
         assert (state.hardening is not None) == LAWS[law].hardens, law
         assert (state.visual is not None) == (not LAWS[law].total), law
         assert state.row is None
+
+
+def test_a_picture_without_a_light_traces_no_shadows(monkeypatch):
+    gaussians = ball(20)
+    splats = as_splats(gaussians)
+    camera = look_at(np.array([1.0, 0, 0.3]), np.array([0.0, 0, 0.3]), focal=20.0, width=16, height=16)
+
+    def drawn(gaussians, splats, shade):
+        return shaded_picture(gaussians, splats, camera, shade, RenderConfig(), jnp.ones(3))
+
+    shade = jnp.ones(20, bool), Light(direction=(0.0, 0.0, -1.0)), jnp.ones(20), jnp.ones(20)
+    on = primitives(jax.make_jaxpr(drawn)(gaussians, splats, shade))
+    monkeypatch.setattr("pigjax.scene.run.cast_shadows", None)  # calling it would fail
+    off = primitives(jax.make_jaxpr(drawn)(gaussians, splats, None))
+    assert on.total() > off.total()
+    assert not {name for name in off if off[name] > on[name]}

@@ -321,7 +321,7 @@ def test_bad_input_is_refused_in_one_sentence():
 
 def load_cloud():
     """The 29,984 Gaussians that were put on the tabletop's depth maps, with their true ids (see examples/tabletop)."""
-    data = np.load(ROOT / "tests/data/tabletop_cloud.npz")
+    data = np.load(ROOT / "examples/tabletop/cloud.npz")
     count = len(data["means"])
     means = data["low"] + data["means"] / 65535 * (data["high"] - data["low"])
     smallest, largest = data["log_scale_range"]

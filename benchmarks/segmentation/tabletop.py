@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.common.pages import ROOT, TABLETOP
+from benchmarks.common.pages import TABLETOP
 from pigjax.core.gaussians import SH_CONSTANT
 from pigjax.core.metrics import score_masks
 from pigjax.io import Views, load_ply, load_views, read_json
@@ -36,7 +36,7 @@ class Tabletop(NamedTuple):
 
 
 def load_tabletop(folder: Path | None = None) -> Tabletop:
-    """Cloud on the depth maps and its views; without `folder` the bundled views and the cloud in tests/data."""
+    """Cloud on the depth maps and its views; without `folder` the bundled views and cloud."""
     if folder is None:
         cloud, truth = _bundled_cloud()
     else:
@@ -48,7 +48,7 @@ def load_tabletop(folder: Path | None = None) -> Tabletop:
 
 
 def _bundled_cloud() -> tuple[Gaussians, np.ndarray]:
-    data = np.load(ROOT / "tests/data/tabletop_cloud.npz")
+    data = np.load(TABLETOP / "cloud.npz")
     count = len(data["means"])
     low, high = data["low"], data["high"]
     smallest, largest = data["log_scale_range"]

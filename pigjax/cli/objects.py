@@ -79,7 +79,7 @@ def reconstruct(
     ] = False,
     refine_poses: Annotated[bool, typer.Option(help="Correct training cameras, into OUT/poses.json.")] = False,
     previews: Annotated[int, typer.Option(help="Steps between preview pictures; 0 for none.", min=0)] = 0,
-    seed: int = 0,
+    seed: Annotated[int, typer.Option(help="Of random numbers, such as the order of photos.")] = 0,
     origin: Origin = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,

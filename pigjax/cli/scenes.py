@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,6 +31,7 @@ from pigjax.cli.base import (
 )
 from pigjax.cli.planning import Accuracy, Error, Memory, Time
 from pigjax.core.errors import InputError
+from pigjax.io.finding import example_folder
 
 File = Annotated[
     Path | None,
@@ -40,15 +40,6 @@ File = Annotated[
         callback=lambda path: None if path is None else output_path(path), metavar="PATH",
     ),
 ]  # fmt: skip
-
-
-def example_folder() -> Path:
-    """The bundled tabletop scene: in the installed package, or in the checkout of an editable install."""
-    for root in (resources.files("pigjax"), Path(__file__).parents[2]):
-        folder = Path(str(root)) / "examples" / "tabletop"
-        if (folder / "scene.toml").is_file():
-            return folder
-    raise InputError("the bundled example examples/tabletop is missing; install pigjax again.")
 
 
 @app.command()

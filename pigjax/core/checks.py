@@ -49,7 +49,7 @@ class Limits:
         if self.low == -_FAR:
             return self._most()
         ends = "(" if self.above else "[", ")" if self.below else "]"
-        return f"in {ends[0]}{self.low:g}, {self.high:g}{ends[1]}{self._unit}"
+        return f"in {ends[0]}{_bound(self.low)}, {_bound(self.high)}{ends[1]}{self._unit}"
 
     def broken(self, value: Any) -> str | None:
         """The rule ("must be > 0 m") that a concrete number or array of numbers breaks; None where all are in range."""
@@ -86,6 +86,11 @@ class Limits:
     @property
     def _unit(self) -> str:
         return f" {self.unit}" if self.unit else ""
+
+
+def _bound(end: int | float) -> str:
+    """Whole numbers in full."""
+    return str(end) if isinstance(end, int) else f"{end:g}"
 
 
 ANY = Limits()

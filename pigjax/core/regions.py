@@ -30,7 +30,7 @@ class BoxRegion(Region):
 
     `BoxRegion(lower=(-0.1, -0.1, 0.0), upper=(0.1, 0.1, 0.12)).contains(x)`
 
-    Args:
+    Attributes:
         lower: corner [m].
         upper: corner [m].
 
@@ -57,7 +57,7 @@ class SphereRegion(Region):
 
     `SphereRegion(centre=(0.0, 0.0, 0.1), radius=0.05).contains(x)`
 
-    Args:
+    Attributes:
         centre: [m].
         radius: [m].
 
@@ -78,7 +78,7 @@ class HalfSpace(Region):
 
     `HalfSpace(point=(0.0, 0.0, 0.1), normal=(0.0, 0.0, 1.0)).contains(x)` is true where z <= 0.1.
 
-    Args:
+    Attributes:
         point: on the plane [m].
         normal: out of the region, any length.
 

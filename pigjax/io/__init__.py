@@ -26,6 +26,7 @@ from pigjax.io.files import (
     write_toml,
     writing,
 )
+from pigjax.io.finding import example_folder
 from pigjax.io.formats import load_gaussians, origin_of, read_gaussians
 from pigjax.io.gltf import Mesh, save_glb, save_mesh
 from pigjax.io.images import contact_sheet, data_uri, read_image, write_image
@@ -71,6 +72,7 @@ __all__ = [
     "describe_capture",
     "digest",
     "digest_of_scene",
+    "example_folder",
     "file_digest",
     "id_named",
     "last_state",

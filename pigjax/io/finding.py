@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
 
@@ -54,6 +55,23 @@ def find_parts(path: PathLike) -> Found:
     names = next((folder / name for name in ("names.json", "labels.json") if (folder / name).is_file()), None)
     photos = 0 if views is not None else max(_pictures(folder / name) for name in _PHOTO_FOLDERS)
     return Found(_trained(folder), views, masks, names, photos, problem)
+
+
+def example_folder() -> Path:
+    """Folder of the bundled tabletop: photos, masks, trained `tabletop.ply` and `scene.toml`. Host.
+
+    `pj.load_ply(pj.example_folder() / "tabletop.ply")`
+
+    It lies in the installed package, or in the checkout of an editable install.
+
+    Raises:
+        InputError: it is missing.
+    """
+    for root in (resources.files("pigjax"), Path(__file__).parents[2]):
+        folder = Path(str(root)) / "examples" / "tabletop"
+        if (folder / "scene.toml").is_file():
+            return folder
+    raise InputError("the bundled example examples/tabletop is missing; install pigjax again.")
 
 
 def _trained(folder: Path) -> Path | None:

@@ -6,14 +6,16 @@ field of plain MPM they would take one velocity: no slip, and cohesion when they
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from pigjax.core.arrays import as_array, static_field
 from pigjax.core.checks import Limits, check_fields
 from pigjax.core.errors import InputError
-from pigjax.core.linalg import safe_norm, safe_normalize
+from pigjax.core.linalg import safe_norm, safe_normalize, safe_ratio
 
 # Distance of the centres of two touching half spaces within a node's reach [cells]: 0.81 at a node on their
 # border, 0.9 half a cell off it (the idea: Nairn and Guilkey 2015, doi 10.1002/nme.4834, sec. 3).
@@ -27,6 +29,13 @@ def broken_by(integrator: str) -> str | None:
     Implicit steps balance one velocity field, and "auto" may choose them.
     """
     return None if integrator == "explicit" else "contact between bodies needs explicit steps; take 'explicit'"
+
+
+class Faces(NamedTuple):
+    """Where bodies touch each other."""
+
+    near: Bool[Array, "b x y z 1"]  # nodes at which a body touches others
+    normal: Float[Array, "b x y z 3"]  # out of the body
 
 
 class BodyContact(eqx.Module):
@@ -47,47 +56,40 @@ class BodyContact(eqx.Module):
         check_fields(self)
 
     def part(
-        self,
-        velocity: Float[Array, "b x y z 3"],
-        mass: Float[Array, "b x y z 1"],
-        volume: Float[Array, "b x y z 1"],
-        moments: Float[Array, "b x y z 3"],
+        self, velocity: Float[Array, "b x y z 3"], mass: Float[Array, "b x y z 1"], faces: Faces
     ) -> Float[Array, "b x y z 3"]:
-        """Velocities of each body's nodes [m/s] after contact; momentum is conserved.
-
-        Args:
-            velocity: before contact [m/s].
-            mass: in units of the heaviest particle.
-            volume: at rest [cells].
-            moments: Σ w V x of the matter in reach of a node, with x in cells.
-        """
+        """Velocities of each body's nodes [m/s] after contact at its faces; momentum of the masses is conserved."""
+        near, normal = faces
         total = mass.sum(0)
         common = (mass * velocity).sum(0) / jnp.where(total > 0, total, 1.0)
-        others = volume.sum(0) - volume
-        # The normal points out of the body into the others, where their volume grows by as much as its own falls. Where
-        # both change alike their ends lie side by side, and where one changes alone it has an edge: neither tilts the
-        # normal. Normals of two bodies are opposite, so that their impulses are too.
-        growth, fall = _gradient(others) * volume, -_gradient(volume) * others
-        less = jnp.where(jnp.abs(growth) < jnp.abs(fall), growth, fall)
-        normal = safe_normalize(jnp.where((growth > 0) == (fall > 0), less, 0.0))
-        distance = _middle(moments.sum(0) - moments, others) - _middle(moments, volume)
-        gap = (distance * normal).sum(-1, keepdims=True)
-        aside = safe_norm(distance - gap * normal)[
-            ..., None
-        ]  # large where the normal of an edge is not that of the faces
-        near = (gap < _TOUCHING) & (aside < _TOUCHING) & (jnp.minimum(volume, others) > _SHARED * (volume + others))
-
         relative = velocity - common
         approach = (relative * normal).sum(-1, keepdims=True)
         glide = relative - approach * normal
         speed = safe_norm(glide)[..., None]
-        kept = jnp.maximum(1 - self.friction * approach / jnp.where(speed > 0, speed, 1.0), 0.0)
+        kept = jnp.maximum(1 - safe_ratio(self.friction * approach, speed), 0.0)
         met = near & (approach > 0)
         parted = jnp.where(met, common + kept * glide, velocity)
         # with three bodies or more at a node, normals are not quite opposite
         missing = (mass * (velocity - parted)).sum(0)
         sharing = jnp.where(met, mass, 0.0).sum(0)
         return parted + jnp.where(met, missing / jnp.where(sharing > 0, sharing, 1.0), 0.0)
+
+
+def faces(volume: Float[Array, "b x y z 1"], moments: Float[Array, "b x y z 3"]) -> Faces:
+    """Where bodies touch, by the volumes at rest [cells] and Σ w V x of the matter in reach of the nodes [cells]."""
+    others = volume.sum(0) - volume
+    # The normal points out of the body into the others, where their volume grows by as much as its own falls. Where
+    # both change alike their ends lie side by side, and where one changes alone it has an edge: neither tilts the
+    # normal. Normals of two bodies are opposite, so that their impulses are too.
+    growth, fall = _gradient(others) * volume, -_gradient(volume) * others
+    less = jnp.where(jnp.abs(growth) < jnp.abs(fall), growth, fall)
+    normal = safe_normalize(jnp.where((growth > 0) == (fall > 0), less, 0.0))
+    distance = _middle(moments.sum(0) - moments, others) - _middle(moments, volume)
+    gap = (distance * normal).sum(-1, keepdims=True)
+    # large where the normal of an edge is not that of the faces
+    aside = safe_norm(distance - gap * normal)[..., None]
+    near = (gap < _TOUCHING) & (aside < _TOUCHING) & (jnp.minimum(volume, others) > _SHARED * (volume + others))
+    return Faces(near, normal)
 
 
 def _middle(moments: Float[Array, "b x y z 3"], volume: Float[Array, "b x y z 1"]) -> Float[Array, "b x y z 3"]:

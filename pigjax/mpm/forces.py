@@ -50,7 +50,7 @@ class Force(eqx.Module):
     A force acts on the particles of its `region`, as strongly as their `weights` say, from `start` to `end`; a step in
     which it begins or ends counts in part. Fields that are None are not traced.
 
-    Args:
+    Attributes:
         weights: of each particle, 0 where the force does not act; None, the default: 1 for all.
         region: where it acts (`BoxRegion`, `SphereRegion`, `HalfSpace`); None, the default: everywhere.
         start: when it begins [s]; None, the default: it always has.
@@ -160,14 +160,15 @@ class Wind(Force):
 
     `Wind(velocity=(3.0, 0.0, 0.0), drag=2.0, gusts=1.0, gust_size=0.5)`
 
-    Args:
+    `weights`, `region`, `start`, `end` and `elapsed` are those of `Force`.
+
+    Attributes:
         velocity: of the wind [m/s].
         drag: k [1/s]: still matter gets the speed of the wind in about 1/k; for a thin leaf of 0.1 kg/m², 1 to 10.
         quadratic_drag: q [1/m], ½ c ρ A / m of a body; None, the default: 0.
         gusts: root mean square of the gusts' speed [m/s]; None, the default: a steady wind.
         gust_size: length of the longest wave of the gusts [m]; the default, 1, is a room's.
         seed: of the gusts.
-        weights, region, start, end, elapsed: as of `Force`.
 
     Raises:
         InputError: as `Force`.
@@ -226,11 +227,12 @@ class ForceField(Force):
 
     `ForceField((0.0, 0.0, 12.0), region=BoxRegion(lower=(0, 0, 0), upper=(1, 1, 1)), start=0.5, end=1.0)`
 
-    Args:
+    `weights`, `region`, `start`, `end` and `elapsed` are those of `Force`.
+
+    Attributes:
         acceleration: a [m/s²].
         gradient: G, by row the derivatives of one component [1/s²]; None, the default: a uniform field.
         centre: c [m]; the default is the world's origin.
-        weights, region, start, end, elapsed: as of `Force`.
 
     Raises:
         InputError: as `Force`.
@@ -255,9 +257,10 @@ class Impulse(Force):
 
     `Impulse((0.0, 0.3, 0.0), region=SphereRegion(centre=(0, 0, 0.1), radius=0.03), start=0.5)`
 
-    Args:
+    `weights`, `region` and `elapsed` are those of `Force`.
+
+    Attributes:
         momentum: [N s].
-        weights, region, elapsed: as of `Force`.
         start: when it begins [s]; None, the default: at the start of the rollout.
         end: when it ends [s]; None, the default: after one step.
 
@@ -309,12 +312,13 @@ class Spring(Force):
 
     `Spring((0.2, 0.0, 0.5), stiffness=40.0, damping=2.0, weights=weights)`
 
-    Args:
+    `weights`, `region`, `start`, `end` and `elapsed` are those of `Force`.
+
+    Attributes:
         target: T at time 0 [m].
         stiffness: k [N/m].
         damping: c [N s/m]; the default is none.
         velocity: U [m/s]; None, the default: the target is still.
-        weights, region, start, end, elapsed: as of `Force`.
 
     Raises:
         InputError: as `Force`.

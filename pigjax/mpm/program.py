@@ -34,6 +34,7 @@ from pigjax.mpm import (
     to_rows,
 )
 from pigjax.mpm.adjoint import Steps, run_steps
+from pigjax.mpm.boundaries import touched_nodes
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.forces import Force, columns_of, weights_of, without_weights
@@ -46,7 +47,6 @@ from pigjax.mpm.substep import (
     grid_to_particles,
     particles_to_grid,
     substep,
-    touched_nodes,
     update_grid,
 )
 from pigjax.mpm.transfers import KERNELS
@@ -140,6 +140,7 @@ def run_frames(
         unit_mass=lax.stop_gradient(jnp.where(jnp.isfinite(particles.mass), particles.mass, 0).max()),
         opaque_true=everywhere(~(particles.volume0[0] < -jnp.finfo(dtype).max)),  # true of NaN too
         forces=without_weights(inputs.forces),
+        rigid=_rigid_bodies(particles, table, bodies),
     )
     statics = StepStatics(
         kernel=kernel,
@@ -155,6 +156,7 @@ def run_frames(
         force_columns=columns_of(inputs.forces),
         warp=warp,
         in_order=config.deterministic,
+        contact_rounds=config.contact_rounds,
     )
     run = partial(_frames, statics, config, frames, inputs.substeps, of or frames)
     if devices > 1:
@@ -310,6 +312,15 @@ def _held_nodes(
         inside = region.contains(points)
         touched = inside if touched is None else touched | inside
     return touched
+
+
+def _rigid_bodies(particles: Particles, table: MaterialTable, bodies: int) -> Bool[Array, "b"] | None:
+    """Which bodies have rigid matter; None where there is none. Without contact between bodies all matter is one."""
+    rows = np.array([law == "rigid" for law in table.laws])
+    if not any(count for count, own in zip(particles.counts, rows) if own):
+        return None
+    own = jnp.asarray(rows)[particles.material].astype(int)
+    return jax.ops.segment_max(own, particles.body if bodies > 1 else 0 * particles.body, bodies) > 0
 
 
 def _specific_volume(particles: Particles, bodies: int) -> Float[Array, "b"]:

@@ -1,7 +1,7 @@
 """Plain MLS-MPM on dense arrays: the stages of `substep`, to read and to test the fast path against.
 
 No chunks, window, devices or derivative rules: equations as in the `mls_mpm` docstring, one line each. It covers
-explicit steps of every law with colliders and walls, and no contact between bodies.
+explicit steps of every law but "rigid" with colliders and walls, and no contact between bodies.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.mpm import Grid, Particles, SimConfig
+from pigjax.mpm.boundaries import apply_walls, places_of
 from pigjax.mpm.colliders import Collider, Time
 from pigjax.mpm.materials import LAWS, MaterialTable, respond
-from pigjax.mpm.substep import apply_walls
 from pigjax.mpm.transfers import KERNELS, Kernel
 
 
@@ -77,7 +77,7 @@ def update_grid(
     for collider in colliders:
         velocity = collider.apply(collider.contact(grid.points, time), velocity)
     velocity = jnp.where(frozen[..., None], 0.0, velocity)
-    return apply_walls(velocity, config.walls, jnp.zeros(3, int), jnp.asarray(grid.shape))
+    return apply_walls(velocity, config.walls, places_of(grid.shape, jnp.zeros(3, int)), jnp.asarray(grid.shape))
 
 
 def grid_to_particles(

@@ -8,7 +8,7 @@ chunks or devices.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -20,14 +20,16 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.mpm import WALL, Grid, State, StepHealth
+from pigjax.mpm.boundaries import Bounds, clear_of, hold, places_of
 from pigjax.mpm.by_law import by_component, by_row
 from pigjax.mpm.chunked import ChunkLoop, gather_chunks, scatter_chunks
 from pigjax.mpm.colliders import Collider, Contact, Press, Time
-from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.contact import BodyContact, Faces, faces
 from pigjax.mpm.forces import Force, Matter
 from pigjax.mpm.health import LaneHealth
 from pigjax.mpm.materials import Parameters, respond
 from pigjax.mpm.materials.tensors import determinant, product
+from pigjax.mpm.rigid import Meeting, rigid_velocities
 from pigjax.mpm.transfers import (
     CHANNELS,
     Kernel,
@@ -37,7 +39,6 @@ from pigjax.mpm.transfers import (
     affine_momentum,
     as_channels,
     distances,
-    first_nodes,
     gather_window,
     gather_window_vjp,
     no_fuse,
@@ -65,6 +66,7 @@ class StepStatics(NamedTuple):
     force_columns: tuple[int | None, ...] = ()  # row of `State.weights` that each force reads
     warp: bool = False  # whether the transfers are Warp kernels (`warp_transfers`), for all particles at once
     in_order: bool = False  # whether these add to a node in a fixed order
+    contact_rounds: int = 20  # in which contact of rigid bodies is solved
 
 
 class StepContext(NamedTuple):
@@ -84,6 +86,7 @@ class StepContext(NamedTuple):
     unit_mass: Float[Array, ""]  # of the heaviest particle [kg]
     opaque_true: Bool[Array, ""]  # for `transfers.no_fuse`
     forces: tuple[Force, ...] = ()  # beside gravity; particles carry their weights
+    rigid: Bool[Array, "b"] | None = None  # which bodies are rigid; None: none is
 
     @property
     def bodies(self) -> int:
@@ -171,7 +174,9 @@ def update_grid(
     with jax.named_scope("update_grid"):
         if statics.solve_balance is not None:
             return statics.solve_balance(statics, context, states, nodes, time)
-        _, velocity = free_velocity(context, nodes)
+        filled, velocity = free_velocity(context, nodes)
+        if context.rigid is not None:
+            return _rigid_step(statics, context, states, nodes, filled, velocity, time), True
         if context.body_contact is not None:
             velocity = _separate_bodies(statics, context, states, nodes, velocity)
         return apply_boundaries(statics, context, velocity, time=time), True
@@ -460,23 +465,72 @@ def _separate_bodies(
     nodes: Float[Array, "n y z 4"],
     velocity: Float[Array, "b x y z 3"],
 ) -> Float[Array, "b x y z 3"]:
-    """Velocities after contact between bodies. P2G brings the place of their matter to the grid as it does momentum."""
+    """Velocities after contact between bodies."""
     assert context.body_contact is not None
-    assert context.specific_volume is not None
+    mass = nodes.reshape(context.bodies, *context.grid.shape, 4)[..., :1] / context.unit_mass
+    return context.body_contact.part(velocity, mass, _faces(context, nodes, _moments(statics, context, states)))
+
+
+def _moments(statics: StepStatics, context: StepContext, states: tuple[State, ...]) -> Float[Array, "b x y z 3"]:
+    """Σ w m x of each body's matter in reach of a node, with x in cells: P2G brings it to the grid as momentum."""
     width = context.grid.shape[0]
 
-    def moments(state):
+    def placed(state):
         along = jnp.array([1, 0, 0], state.cells.dtype)[:, None]
         place = state.cells - jnp.floor(state.cells[:, :1] / width) * width * along
         return state._replace(v=place, C=0 * state.C, stress=0 * state.stress)
 
-    moment = particles_to_grid(statics, context, tuple(map(moments, states)))
-    apart = (context.bodies, *context.grid.shape, 4)
-    mass = nodes.reshape(apart)[..., :1]
+    moment = particles_to_grid(statics, context, tuple(map(placed, states)))
+    return moment.reshape(context.bodies, *context.grid.shape, 4)[..., 1:]
+
+
+def _faces(context: StepContext, nodes: Float[Array, "n y z 4"], moments: Float[Array, "b x y z 3"]) -> Faces:
+    """Where bodies touch."""
+    assert context.specific_volume is not None
     specific = context.specific_volume[:, None, None, None, None]
-    return context.body_contact.part(
-        velocity, mass / context.unit_mass, specific * mass, specific * moment.reshape(apart)[..., 1:]
-    )
+    return faces(specific * nodes.reshape(*moments.shape[:-1], 4)[..., :1], specific * moments)
+
+
+def _rigid_step(
+    statics: StepStatics,
+    context: StepContext,
+    states: tuple[State, ...],
+    nodes: Float[Array, "n y z 4"],
+    filled: Bool[Array, "*b x y z 1"],
+    velocity: Float[Array, "*b x y z 3"],
+    time: Time,
+) -> Float[Array, "n y z 3"]:
+    """Velocities of the nodes where some bodies are rigid, after contact, colliders and walls."""
+    assert context.rigid is not None
+    apart = (context.bodies, *context.grid.shape)
+    filled, velocity = filled.reshape(*apart, 1), velocity.reshape(*apart, 3)
+    mass = jnp.where(filled, nodes.reshape(*apart, 4)[..., :1] / context.unit_mass, 0.0)
+    places = places_of(context.grid.shape, context.low)
+    bounds = Bounds(tuple(_contacts(context, time)), context.frozen, places).at_all(context.grid.shape)
+    meets, moments = bounds.holds(context.domain)[..., None], _moments(statics, context, states)
+    between = None if context.body_contact is None else _faces(context, nodes, moments)
+    meets = meets if between is None else meets | between.near
+    middle = moments / jnp.where(filled, nodes.reshape(*apart, 4)[..., :1], 1.0)
+    stiff = context.rigid[:, None, None, None]
+
+    def part(velocity, mass, own):
+        assert context.body_contact is not None
+        return context.body_contact.part(velocity, mass, own[0])
+
+    def hold_all(velocity, bounds, clear):
+        return hold(velocity, context.colliders, bounds, statics.walls, context.domain, clear=clear)
+
+    def clear(own, bounds):
+        at = (jnp.stack(bounds.places, -1) - context.low).astype(velocity.dtype)
+        found = partial(clear_of, grid=context.grid, nodes=at, middle=own[1], time=time)
+        return tuple(stiff & found(collider) for collider in context.colliders)
+
+    contact = Meeting(None if between is None else part, hold_all, clear)
+    cells = context.dt / context.grid.dx
+    return rigid_velocities(
+        context.rigid, mass, velocity, filled & meets, contact, (between, middle), bounds, cells,
+        statics.contact_rounds,
+    ).reshape(*context.nodes, 3)  # fmt: skip
 
 
 def apply_boundaries(
@@ -496,39 +550,12 @@ def apply_boundaries(
         time: since the colliders were where their numbers say [s].
         press: how nodes press against each collider, if friction must follow that; None: by their velocity.
     """
-    for k, (collider, contact) in enumerate(zip(context.colliders, context.collider_contacts)):
-        contact = collider.contact(context.grid.points, time) if contact is None else contact
-        velocity = collider.apply(contact, velocity, None if press is None else press[k])
-    if context.frozen is not None:
-        velocity = jnp.where(context.frozen[..., None], 0.0, velocity)
-    return apply_walls(velocity, statics.walls, context.low, context.domain).reshape(*context.nodes, 3)
+    bounds = Bounds(_contacts(context, time), context.frozen, places_of(context.grid.shape, context.low))
+    held = hold(velocity, context.colliders, bounds, statics.walls, context.domain, press)
+    return held.reshape(*context.nodes, 3)
 
 
-def apply_walls(
-    velocity: Float[Array, "*b x y z 3"], mode: str | None, low: Int[Array, "3"], domain: Int[Array, "3"]
-) -> Float[Array, "*b x y z 3"]:
-    """Velocities of the nodes after the walls of the domain, of which the window begins at node `low`."""
-    components = [velocity[..., k] for k in range(3)]
-    for axis, nodes in enumerate(velocity.shape[-4:-1]):
-        index = (jnp.arange(nodes) + low[axis]).reshape([-1 if k == axis else 1 for k in range(3)])
-        lower, upper = index < WALL, index >= domain[axis] - WALL
-        if mode == "sticky":
-            components = [jnp.where(lower | upper, 0.0, v) for v in components]
-        elif mode == "slip":
-            components[axis] = jnp.where(lower | upper, 0.0, components[axis])
-        else:
-            v = components[axis]
-            components[axis] = jnp.where(lower, jnp.maximum(v, 0.0), jnp.where(upper, jnp.minimum(v, 0.0), v))
-    return jnp.stack(components, -1)
-
-
-def touched_nodes(grid: Grid, x: Float[Array, "p 3"], kernel: Kernel) -> Bool[Array, "nx ny nz"]:
-    """Nodes in the support of particles [m]; those outside of the grid touch none."""
-    cells = (x - grid.origin) / grid.dx
-    last = jnp.asarray(grid.shape, x.dtype) - 1
-    near = ((cells >= -1) & (cells <= last + 1)).all(1)
-    cells = jnp.clip(cells, 1, last - 1)
-    first = first_nodes(cells.T, kernel, grid.shape).T
-    offsets = np.stack(np.meshgrid(*[np.arange(len(kernel.offsets))] * 3, indexing="ij"), -1).reshape(-1, 3)
-    i, j, k = jnp.moveaxis(first[:, None] + offsets, -1, 0)
-    return jnp.zeros(grid.shape, bool).at[i, j, k].max(near[:, None])
+def _contacts(context: StepContext, time: Time) -> Iterator[Contact]:
+    """Contact of each collider with the nodes."""
+    for collider, contact in zip(context.colliders, context.collider_contacts):
+        yield collider.contact(context.grid.points, time) if contact is None else contact

@@ -109,7 +109,7 @@ def _soft(
     if pull == 0:
         return
     for row, name in enumerate(moving):
-        if table.laws[row] in _LOOSE or table.laws[row] == "stationary" or not (rows == row).any():
+        if table.laws[row] in (*_LOOSE, "stationary", "rigid") or not (rows == row).any():
             continue
         heights = np.dot(x[rows == row], gravity / pull)
         height = float(np.subtract(*np.quantile(heights, [0.99, 0.01])))

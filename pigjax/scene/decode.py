@@ -124,7 +124,7 @@ def wanted(kind: Any) -> str:
     if origin is Literal:
         return f"one of {', '.join(map(str, args))}"
     if origin is tuple and args[-1] is not Ellipsis:
-        return f"{len(args)} numbers"
+        return f"{len(args)} rows of {wanted(args[0])}" if get_origin(args[0]) is tuple else f"{len(args)} numbers"
     if origin in (tuple, list):
         inner = wanted(args[0])
         return "a list of numbers" if inner == "a number" else f"a list (each {inner})"

@@ -33,7 +33,7 @@ class ForceSpec(Section, frozen=True, kw_only=True):
     own_fields: ClassVar[frozenset[str]] = frozenset({"kind", "objects", "region"})  # that are no numbers of the force
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
-        """It ends after it begins."""
+        """It ends after it begins, and acts on one object or more."""
         ordered = self.start is None or self.end is None or self.start <= self.end
         yield "end", ordered, f"it must not be before start = {self.start} s"
         yield "objects", self.objects is None or len(self.objects) > 0, "name one or more, or leave it out for all"
@@ -75,37 +75,38 @@ class ForceSpec(Section, frozen=True, kw_only=True):
 class WindSpec(ForceSpec, frozen=True, kw_only=True):
     """Wind that drags matter along; see `Wind`."""
 
-    kind: Literal["wind"]
-    velocity: Annotated[_Triple, _SPEED]
-    drag: Annotated[float, Limits(0, 1e9, unit="1/s")] = 2.0  # rate at which matter takes the wind's velocity
+    kind: Literal["wind"]  # which force it is
+    velocity: Annotated[_Triple, _SPEED]  # of the air
+    # rate at which matter takes the wind's velocity; 1 to 10: leaves
+    drag: Annotated[float, Limits(0, 1e9, unit="1/s")] = 2.0
     quadratic_drag: Annotated[float, Limits(0, 1e9, unit="1/m")] | None = None  # the same per speed; None: 0
     gusts: Annotated[float, Limits(0, 1e6, unit="m/s")] | None = None  # root mean square of their speed; None: steady
-    gust_size: Annotated[float, Limits(0, 1e9, above=True, unit="m")] = 1.0  # length of their longest wave
-    seed: Annotated[int, Limits(0, LARGEST_WHOLE)] = 0  # of the gusts
+    gust_size: Annotated[float, Limits(0, 1e9, above=True, unit="m")] = 1.0  # length of their longest wave; 1: a room's
+    seed: Annotated[int, Limits(0, LARGEST_WHOLE)] = 0  # of the gusts' waves
     force = Wind
 
 
 class FieldSpec(ForceSpec, frozen=True, kw_only=True):
     """An acceleration that is uniform or linear in space; see `ForceField`."""
 
-    kind: Literal["field"]
-    acceleration: Annotated[_Triple, Limits(-1e9, 1e9, unit="m/s²")] = (0.0, 0.0, 0.0)
-    # by row the derivatives of one component
+    kind: Literal["field"]  # which force it is
+    acceleration: Annotated[_Triple, Limits(-1e9, 1e9, unit="m/s²")] = (0.0, 0.0, 0.0)  # at `centre`
+    # its derivatives: row i holds those of component i along x, y, z; None: the acceleration is uniform
     gradient: Annotated[tuple[_Triple, _Triple, _Triple], Limits(-1e9, 1e9, unit="1/s²")] | None = None
     centre: Annotated[_Triple, _PLACE] | None = None  # where the acceleration is as given; None: the origin
     force = ForceField
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
-        """It does something."""
+        """It has an acceleration or a gradient, and it ends after it begins."""
         yield from super().rules()
         given = any(self.acceleration) or self.gradient is not None
         yield "acceleration", given, "give it, or a gradient: a field without either does nothing"
 
 
 class ImpulseSpec(ForceSpec, frozen=True, kw_only=True):
-    """A blow, shared by mass; see `Impulse`."""
+    """A blow that gives all of the matter one change of velocity; see `Impulse`."""
 
-    kind: Literal["impulse"]
+    kind: Literal["impulse"]  # which force it is
     momentum: Annotated[_Triple, Limits(-1e9, 1e9, unit="N s")]  # that matter receives in all
     force = Impulse
 
@@ -113,10 +114,11 @@ class ImpulseSpec(ForceSpec, frozen=True, kw_only=True):
 class SpringSpec(ForceSpec, frozen=True, kw_only=True):
     """A spring and damper from the middle of matter, picked at rest, to a point that may move; see `Spring`."""
 
-    kind: Literal["spring"]
-    target: Annotated[_Triple, _PLACE] | None = None  # None: the middle of the picked matter
+    kind: Literal["spring"]  # which force it is
+    target: Annotated[_Triple, _PLACE] | None = None  # end of the spring; None: the middle of the picked matter
     velocity: Annotated[_Triple, _SPEED] | None = None  # of the target; None: it is still
-    stiffness: Annotated[float, Limits(0, 1e12, above=True, unit="N/m")]
+    stiffness: Annotated[float, Limits(0, 1e12, above=True, unit="N/m")]  # force for each metre between the two
+    # force for each m/s between the two; 0: it swings on
     damping: Annotated[float, Limits(0, 1e12, unit="N s/m")] = 0.0
     force = Spring
 

@@ -28,8 +28,9 @@ class ParameterSpec(Section, frozen=True):
 
     values: list[Value] | None = None  # of a sweep; None: `count` of them from low to high
     low: Value | None = None  # bounds of a search, or ends of a sweep; one for all components, or one each
-    high: Value | None = None
-    count: Annotated[int, Limits(1, MOST_ROWS)] = 5
+    high: Value | None = None  # the other bound or end
+    count: Annotated[int, Limits(1, MOST_ROWS)] = 5  # number of values of a sweep from low to high
+    # "log": values of a sweep have equal ratios, and steps of a search multiply
     scale: Literal["linear", "log"] = "linear"
     start: Value | None = None  # of a search; None: the scene's own value
 
@@ -74,20 +75,23 @@ class SweepSpec(Section, frozen=True):
 
     join: Literal["grid", "rows"] = "grid"  # all combinations, or the k-th value of each together
     batch: Annotated[int, Limits(1, MOST_ROWS)] | None = None  # rows at once; None: as many as memory holds
-    best: Literal["min", "max"] = "min"
-    of: str = "loss"  # the result that is judged and drawn
+    best: Literal["min", "max"] = "min"  # whether the least or the greatest result is the best
+    of: str = "loss"  # name of the result that is judged and drawn, a column of the table
 
 
 class TuneSpec(Section, frozen=True):
     """The search for the least loss."""
 
-    method: Literal["adam", "cma"] = "adam"  # by gradients, or without
-    rate: Annotated[float, Limits(0, 1e3, above=True)] = 0.05  # of Adam, in the unit of the bounds' transform
-    steps: Annotated[int, Limits(1, 10_000_000)] = 100  # of Adam, or losses evaluated without gradients
-    clip: Annotated[float, Limits(0, above=True)] | None = None  # largest norm of a gradient
-    patience: Annotated[int, Limits(1, LARGEST_WHOLE)] | None = None  # steps without a better loss before it stops
+    method: Literal["adam", "cma"] = "adam"  # "adam" follows gradients, "cma" needs none (pip install '.[search]')
+    # step of Adam on the number behind the sigmoid of its bounds; 0.05 moves one that is midway by 1 % of their range
+    rate: Annotated[float, Limits(0, 1e3, above=True)] = 0.05
+    steps: Annotated[int, Limits(1, 10_000_000)] = 100  # of Adam, or evaluations of the loss by cma
+    clip: Annotated[float, Limits(0, above=True)] | None = None  # largest norm of a gradient; None: not limited
+    # steps without a better loss before it stops; None: all `steps` are taken
+    patience: Annotated[int, Limits(1, LARGEST_WHOLE)] | None = None
+    # of Adam from its best with half the rate, after `patience` steps without a better loss
     restarts: Annotated[int, Limits(0, 10_000)] = 0
-    seed: Annotated[int, Limits(0, LARGEST_WHOLE)] = 0
+    seed: Annotated[int, Limits(0, LARGEST_WHOLE)] = 0  # of the samples of cma
 
 
 class MotionOptions(Section, frozen=True):
@@ -110,7 +114,9 @@ class AimOptions(Section, frozen=True):
 class ShapeOptions(Section, frozen=True):
     """Options of the objective `shape`."""
 
+    # longest over middle axis of a splat that counts as a needle
     aspect: Annotated[float, Limits(0, above=True)] = 10.0
+    # longest axis over that at rest of a splat that counts as a needle
     stretch: Annotated[float, Limits(0, above=True)] = 3.0
 
 
@@ -139,8 +145,8 @@ OPTIONS: dict[str, type[Section]] = {
 class ObjectiveSpec(Section, frozen=True):
     """The objective: one of `study.OBJECTIVES`, or `file.py:function` beside the study file."""
 
-    function: str
-    options: dict[str, Any] = field(default_factory=dict)
+    function: str  # motion, aim, shape, video, votes, or file.py:function beside the study file
+    options: dict[str, Any] = field(default_factory=dict)  # of that objective; see below
 
     def check(self) -> None:
         """Whether there is such an objective, and its options are right as far as they are known. Host.
@@ -163,15 +169,15 @@ class Study(Section, frozen=True):
     """A whole study file."""
 
     scene: str  # scene file, relative to the study file
-    objective: ObjectiveSpec
-    parameters: dict[str, ParameterSpec]
+    objective: ObjectiveSpec  # what is scored
+    parameters: dict[str, ParameterSpec]  # by name: a field of the scene such as "objects.duck.young"
     # fields of the scene that differ here: "simulation.frames" = 8
     overrides: dict[str, Any] = field(default_factory=dict)
     only: list[str] | None = None  # objects that are simulated and drawn; None: all of the scene
     # parts of an object with numbers of their own
     regions: dict[str, Annotated[int, Limits(1, 10_000)]] = field(default_factory=dict)
-    sweep: SweepSpec = SweepSpec()
-    tune: TuneSpec = TuneSpec()
+    sweep: SweepSpec = SweepSpec()  # of `pigjax sweep`
+    tune: TuneSpec = TuneSpec()  # of `pigjax tune`
     folder: str = "."  # set by `load_study`; the base of relative paths
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:

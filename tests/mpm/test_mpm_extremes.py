@@ -25,7 +25,9 @@ FRAMES, SUBSTEPS = 4, 10
 STEPS = FRAMES * SUBSTEPS
 CONFIG = SimConfig(substeps=SUBSTEPS, force=True)
 ROW = np.repeat([0, 1], 32)  # the lower half of a cube is of the first material
-MOVING = [law for law, kind in LAWS.items() if kind.respond is not None]
+# one law that tears stands for all, and rigid matter has no stress
+LEFT_OUT = ("tearing_fixed_corotated", "tearing_stvk_hencky", "tearing_fibres", "rigid")
+MOVING = [law for law, kind in LAWS.items() if kind.respond is not None and law not in LEFT_OUT]
 STEP = 1e-3  # of most tests [s]
 few = partial(hypothesis.settings, deadline=None, derandomize=True)
 
@@ -401,6 +403,7 @@ def test_gradients_are_finite_where_the_forward_pass_is(gradient, case):
 def numbers_of(law, young, poisson):
     own = {
         "fibres": {"fibre_stiffness": 2 * young},
+        "tearing_neo_hookean": {"tearing_stretch": 1.5},
         "von_mises": {"yield_stress": young / 40},
         "plasticine": {"yield_stress": young / 40, "hardening_modulus": -young / 20},
         "drucker_prager": {"friction_angle": 0.6},

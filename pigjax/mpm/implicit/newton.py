@@ -176,7 +176,7 @@ def _direction(
         inside = free(r)
         return inside / step.scale + (r - inside) / (step.scale + step.hold)
 
-    symmetric = all(LAWS[law].total for law in step.statics.laws)
+    symmetric = all(LAWS[law].total and not LAWS[law].hardens for law in step.statics.laws)
     solve = conjugate_gradients if symmetric else stabilized_gradients
     about = precondition(diagonal, modes, coarse + in_modes(held, modes))
     steps = step.statics.krylov_steps

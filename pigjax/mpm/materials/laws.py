@@ -7,13 +7,13 @@ return point against a closed form.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pigjax.core.errors import InputError
-from pigjax.mpm.materials import elastic, fibres, fluid, foam, plastic, plasticine, snow
+from pigjax.mpm.materials import elastic, fibres, fluid, foam, plastic, plasticine, snow, tearing
 from pigjax.mpm.materials.parameters import Parameters
 from pigjax.mpm.materials.tensors import Scalar, Scalars, Tensors, determinant, identity, product, spectral, svd
 
@@ -87,6 +87,20 @@ def _elastic(
     return Law(step, ("young", "poisson", *needs), total=True, hardens=False, modulus=modulus)
 
 
+def _tearing(
+    stress: Callable[..., Tensors], *, needs: tuple[str, ...] = (), modulus: Modulus = _pressure_modulus
+) -> Law:
+    """The law of `_elastic` with a limit of stretch; its internal variable is the damage."""
+
+    def step(F, rate, dt, hardening, m):
+        F = F + dt * product(rate, F)
+        torn, damage = tearing.torn_stress(stress, F, hardening, m)
+        return Response(F, damage, torn)
+
+    needs = ("young", "poisson", *needs, "tearing_stretch")
+    return Law(step, needs, total=True, hardens=True, modulus=modulus)
+
+
 def _plastic(flow: Flow, *, needs: tuple[str, ...], hardens: bool = True, modulus: Modulus = _pressure_modulus) -> Law:
     """A law of `flow(trial stretches, hardening, dt, m) -> (stretches, hardening, principal stresses)`."""
 
@@ -129,15 +143,30 @@ def _fluid(F: Tensors, rate: Tensors, dt: Scalar, hardening: Scalars | None, m: 
     return Response(jnp.cbrt(J) * identity(F), hardening, fluid.newtonian(J, rate, m))
 
 
+def _fibre_modulus(m: Parameters) -> Scalars:
+    return _pressure_modulus(m) + m.fibre_stiffness
+
+
+# each as it is, and with the name TEARING before its own as matter that tears
+_HYPERELASTIC: dict[str, tuple[Callable[..., Tensors], dict[str, Any]]] = {
+    "fixed_corotated": (elastic.fixed_corotated, {}),
+    "neo_hookean": (elastic.neo_hookean, {}),
+    "stvk_hencky": (elastic.stvk_hencky, {}),
+    "fibres": (fibres.fibre_reinforced, {"needs": ("fibre_stiffness",), "modulus": _fibre_modulus}),
+}
+TEARING = "tearing_"
+
+
+def _rigid(F: Tensors, rate: Tensors, dt: Scalar, hardening: Scalars | None, m: Parameters) -> Response:
+    """No stress: `mpm.rigid` makes the velocities of the grid those of a rigid body, by which F only turns."""
+    return Response(F + dt * product(rate, F), hardening, jnp.zeros_like(F))
+
+
+_RIGID_SPEED = 20.0  # of waves that rigid matter would have by the length of its steps [m/s]: soft jelly's, and cheap
+
 LAWS = {
-    "fixed_corotated": _elastic(elastic.fixed_corotated),
-    "neo_hookean": _elastic(elastic.neo_hookean),
-    "stvk_hencky": _elastic(elastic.stvk_hencky),
-    "fibres": _elastic(
-        fibres.fibre_reinforced,
-        needs=("fibre_stiffness",),
-        modulus=lambda m: _pressure_modulus(m) + m.fibre_stiffness,
-    ),
+    **{name: _elastic(stress, **more) for name, (stress, more) in _HYPERELASTIC.items()},
+    **{TEARING + name: _tearing(stress, **more) for name, (stress, more) in _HYPERELASTIC.items()},
     "von_mises": _plastic(_hencky(plastic.von_mises), needs=("yield_stress",)),
     "plasticine": _plastic(_hencky(plasticine.return_map, plasticine.stress), needs=("yield_stress",)),
     "drucker_prager": _plastic(_hencky(plastic.drucker_prager), needs=("friction_angle",)),
@@ -148,5 +177,6 @@ LAWS = {
     ),
     "foam": _plastic(_foam, needs=("yield_stress", "viscosity", "flow_exponent"), hardens=False),
     "fluid": Law(_fluid, ("bulk",), total=False, hardens=False, modulus=lambda m: m.bulk),
+    "rigid": Law(_rigid, (), total=True, hardens=False, modulus=lambda m: m.density * _RIGID_SPEED**2),
     "stationary": Law(None, (), total=True, hardens=False, modulus=lambda m: jnp.zeros_like(m.density)),
 }

@@ -27,14 +27,15 @@ class Parameters(eqx.Module):
     yield_stress: Float[Array, "*m"] = _number(default=0.0)  # uniaxial [Pa]
     hardening_modulus: Float[Array, "*m"] = _number(default=0.0)  # rise of the yield stress by plastic strain [Pa]
     residual_stress: Float[Array, "*m"] = _number(default=0.0)  # the yield stress softens no further [Pa]
-    friction_angle: Float[Array, "*m"] = _number(default=0.0)  # [rad]
-    cohesion: Float[Array, "*m"] = _number(default=0.0)  # [Pa]
+    friction_angle: Float[Array, "*m"] = _number(default=0.0)  # of sand, about that of its steepest slope [rad]
+    cohesion: Float[Array, "*m"] = _number(default=0.0)  # of sand: shear strength without pressure [Pa]
     bulk_modulus: Float[Array, "*m"] = _number(default=0.0)  # of a fluid; 0: from young and poisson [Pa]
     viscosity: Float[Array, "*m"] = _number(default=0.0)  # dynamic [Pa s]; of a foam [Pa sʰ] with its exponent h
     flow_exponent: Float[Array, "*m"] = _number(default=1.0)  # h of Herschel and Bulkley; 1 is Bingham's, < 1 thins
     hardening_coefficient: Float[Array, "*m"] = _number(default=10.0)  # ξ of snow
     critical_compression: Float[Array, "*m"] = _number(default=2.5e-2)  # strain at which snow is packed
     critical_stretch: Float[Array, "*m"] = _number(default=7.5e-3)  # strain at which snow breaks
+    tearing_stretch: Float[Array, "*m"] = _number(default=0.0)  # length over that at rest at which matter tears
     fibre_stiffness: Float[Array, "*m"] = _number(default=0.0)  # Young's modulus that fibres add along them [Pa]
     fibre_azimuth: Float[Array, "*m"] = _number(default=0.0)  # of fibres at rest, about z from x [rad]
     fibre_elevation: Float[Array, "*m"] = _number(default=0.0)  # of fibres at rest, above the plane of x and y [rad]

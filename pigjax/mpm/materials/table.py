@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -53,6 +54,15 @@ class Material(Parameters):
                     f"{name} = {shown(getattr(self, name))}: {limit} in a material of model {self.model!r}."
                 )
 
+    def __repr__(self) -> str:
+        """The law, and a line for each number that it needs or that is not at its default."""
+        needed = ("density", *law_of(self.model).needs)
+        told = [(f.name, getattr(self, f.name)) for f in fields(Parameters)]
+        told = [(name, value) for name, value in told if name in needed or _given(name, value)]
+        width = max(len(name) for name, _ in told)
+        lines = [f"  {name:{width}} {_told(value)} {LIMITS[name][1].unit}".rstrip() for name, value in told]
+        return "\n".join([f"Material of model {self.model!r}", *lines])
+
 
 # The noun of each number, and its range where a law needs it or it is given.
 LIMITS: dict[str, tuple[str, Limits]] = {
@@ -71,10 +81,35 @@ LIMITS: dict[str, tuple[str, Limits]] = {
     "hardening_coefficient": ("the hardening coefficient", Limits(0.0, 1e3)),
     "critical_compression": ("the critical compression", Limits(0, 1, above=True, below=True)),
     "critical_stretch": ("the critical stretch", Limits(0, 1e3, above=True)),
+    "tearing_stretch": ("the stretch at which matter tears", Limits(1, 1e3, above=True)),
     "fibre_stiffness": ("the stiffness of fibres", Limits(0, above=True, unit="Pa")),
     "fibre_azimuth": ("the azimuth of fibres", Limits(-1e6, 1e6, unit="rad")),
     "fibre_elevation": ("the elevation of fibres", Limits(-1e6, 1e6, unit="rad")),
 }
+
+
+def _given(name: str, value: Any) -> bool:
+    """Whether a number is not at its default; one that is traced counts as given."""
+    default = next(f.default for f in fields(Parameters) if f.name == name)
+    return isinstance(value, jax.core.Tracer) or not is_numeric(value) or bool(np.any(np.asarray(value) != default))
+
+
+def _told(value: Any) -> str:
+    if isinstance(value, jax.core.Tracer):
+        return "traced"
+    if not is_numeric(value):
+        return str(value)
+    return f"{np.asarray(value):.6g}" if np.ndim(value) == 0 else f"array of shape {np.shape(value)}"
+
+
+# What `help` shows: the units and ranges of the numbers, which stand above once.
+Material.__doc__ = "\n".join(
+    [
+        f"{Material.__doc__}",
+        "Numbers, of which the law's must be given:",
+        *(f"    {f.name}: {LIMITS[f.name][0]}, {LIMITS[f.name][1]}" for f in fields(Parameters)),
+    ]
+)
 # Rules between the numbers of one material, by law.
 _JOINT_LIMITS = (
     (
