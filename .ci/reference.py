@@ -63,7 +63,7 @@ def comments_of(kind: type) -> dict[str, str]:
 
 def meaning_of(kind: type, name: str) -> str:
     """Comment of a field where the class or the nearest base defines it; of a material's number that of the laws."""
-    if kind is ObjectSpec and name in LIMITS:
+    if issubclass(kind, ObjectSpec) and name in LIMITS:
         kind = Parameters
     told = next((own[name] for base in kind.__mro__ if Section in base.__mro__ or base is Parameters
                  if name in (own := comments_of(base))), "")  # fmt: skip
@@ -73,7 +73,7 @@ def meaning_of(kind: type, name: str) -> str:
 def rows_of(kind: type[Section]) -> Iterator[Row]:
     """Fields of a section that hold values, in the order of the code."""
     limits = {name: limit for name, _, limit in numbers_of(kind)}
-    if kind is ObjectSpec:
+    if issubclass(kind, ObjectSpec):
         limits |= {name: limit for name, (_, limit) in LIMITS.items() if name in limits}
     for field in fields(kind):
         if field.name in FROM_OUTSIDE:
@@ -83,9 +83,9 @@ def rows_of(kind: type[Section]) -> Iterator[Row]:
         unit, bounds = ("", "") if limit is None else (limit.unit, _range(limit))
         if not unit and meaning.endswith("]") and "[" in meaning:  # "[m]" at the end of a comment
             meaning, _, unit = meaning[:-1].rpartition(" [")
-        if kind is ObjectSpec and field.name in LIMITS and meaning.endswith(f" [{unit}]"):
+        if issubclass(kind, ObjectSpec) and field.name in LIMITS and meaning.endswith(f" [{unit}]"):
             meaning = meaning.removesuffix(f" [{unit}]")
-        default = "of the material" if kind is ObjectSpec and field.name in LIMITS else _default(field)
+        default = "of the material" if issubclass(kind, ObjectSpec) and field.name in LIMITS else _default(field)
         yield Row(field.name, _type(field.type), default, unit, bounds, meaning)
 
 

@@ -16,8 +16,10 @@ from pigjax.core.upright import Upright, find_up
 from pigjax.coupling.binding import at_frame, bind, deform
 from pigjax.coupling.hidden import fill_hidden
 from pigjax.coupling.outliers import cut_outliers
+from pigjax.coupling.own_splats import OwnSplats, make_own_splats
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
+from pigjax.coupling.vessel import vessel_from_gaussians
 from pigjax.io import (
     Views,
     example_folder,
@@ -90,6 +92,7 @@ __all__ = [
     "Material",
     "MaterialTable",
     "MissingFileError",
+    "OwnSplats",
     "Particles",
     "Plane",
     "RenderConfig",
@@ -153,6 +156,7 @@ __all__ = [
     "load_table",
     "load_views",
     "look_at",
+    "make_own_splats",
     "make_particles",
     "material_table",
     "mean_iou",
@@ -188,6 +192,7 @@ __all__ = [
     "sweep_study",
     "tune_study",
     "vast_grid",
+    "vessel_from_gaussians",
     "write_video",
 ]
 

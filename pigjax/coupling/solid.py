@@ -217,6 +217,19 @@ def surface_of(
     return discs.points[sided], discs.normals[sided]
 
 
+def surface_samples(shell: Shell, spacing: float) -> Float[np.ndarray, "s 3"]:
+    """Points on a surface of whatever side, one for each voxel that it passes [m].
+
+    Args:
+        shell: of `shell_of`.
+        spacing: edge of a voxel [m].
+    """
+    kept = _surface_members(shell)
+    samples = disc_samples(shell, kept, spacing)
+    _, owner, counts = np.unique(np.floor(samples / spacing), axis=0, return_inverse=True, return_counts=True)
+    return np.stack([np.bincount(owner.ravel(), samples[:, i]) for i in range(3)], 1) / counts[:, None]
+
+
 def _surface_members(shell: Shell) -> Bool[np.ndarray, "n"]:
     kept = shell.connected & (shell.opacities >= min(_LEAST_OPACITY, np.median(shell.opacities)))
     return kept if kept.any() else shell.connected

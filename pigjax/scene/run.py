@@ -20,7 +20,7 @@ import numpy as np
 from pigjax import io
 from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
-from pigjax.core.errors import SimulationError, StaleError
+from pigjax.core.errors import InputError, SimulationError, StaleError
 from pigjax.core.linalg import safe_norm
 from pigjax.coupling.binding import deform
 from pigjax.mpm import Particles
@@ -33,6 +33,7 @@ from pigjax.scene.arrangement import arrange
 from pigjax.scene.budget import ScenePlan, refined
 from pigjax.scene.costs import Comparison, Pace, Prediction, predict
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
+from pigjax.scene.own import MADE, Liquids, chosen, is_torn, laws_of, liquids_of, smooth_of, with_own
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
 from pigjax.scene.replay import COLLIDER_FILE, REST_FILE, SCENE_FILE, rows_of, store_colliders, store_rest
 from pigjax.scene.report import RunReport
@@ -136,17 +137,10 @@ def _run(
         tell("seed", 0, 1)
         voted, plan = labels, make_plan(scene, inputs, labels)
         labels = plan.labels
-        io.save_labels(
-            out / "labels.npz",
-            labels.object_id,
-            labels.votes,
-            labels.confidence,
-            labels.ids,
-            scene=_mark(scene, inputs),
-        )
-        io.save_rows(out / "states", rows_of(plan.particles, labels), signature=key)
+        rows = rows_of(plan.particles, labels)
+        made = _made_before(out / REST_FILE)
+        _store(scene, inputs, plan, rows, out, key, made)
         store_colliders(out / COLLIDER_FILE, scene, plan.colliders)
-        store_rest(out / REST_FILE, inputs, plan.dx)
         io.write_toml(out / SCENE_FILE, values_of(given, out))
         tell("seed", 1, 1)
     _describe(scene, inputs, plan, labels, report)
@@ -157,7 +151,8 @@ def _run(
     prediction = _predict(scene, inputs, plan, stages, report, planned)
     say(report.plan)
     told = say if planned is not None else None
-    pictures = _Pictures.of(scene, inputs, plan)
+    own_wanted = any(entry.splats != "carried" for entry in scene.objects.values())
+    pictures = None if own_wanted else _Pictures.of(scene, inputs, plan)  # of own splats, they are not known yet
     states = _simulate(scene, plan, stages, out / "states", parts, key, report, tell, told, prediction)
     followed = None
     if frames := min(scene.output.error_frames, scene.simulation.frames):
@@ -167,8 +162,23 @@ def _run(
         with report.stage("simulate"):
             for _ in states:
                 pass
+    seen, shown, liquids = inputs, plan, None
+    if own_wanted:
+        with report.stage("splats"):
+            tell("splats", 0, 1)
+            names = chosen(scene, laws_of(scene, plan), partial(_was_torn, scene, inputs, rows, out / "states", key))
+            seen, shown, own = with_own(scene, inputs, plan, names, stored=made, say=say)
+            if names:
+                rows["gaussian"] = np.asarray(shown.particles.gaussian)
+                _store(scene, seen, shown, rows, out, key, own)
+                liquids = liquids_of(smooth_of(own), rows["object"], plan.particles.x, own["carrier"], plan.dx)
+                report.sizes["own_splats_of"] = {
+                    name: int(np.sum(np.asarray(shown.labels.object_id) == inputs.ids[name])) for name in names
+                }
+            tell("splats", 1, 1)
     with report.stage("draw"):
-        _draw(scene, inputs, plan, labels, pictures, out, key, report, tell, states)
+        pictures = pictures or _Pictures.of(scene, seen, shown)
+        _draw(scene, seen, shown, shown.labels, pictures, out, key, report, tell, states, liquids)
     if followed is not None:
         with report.stage("estimate"):
             tell("estimate", 0, 1)
@@ -205,6 +215,43 @@ def _compare(report: RunReport, prediction: Prediction, say: Say | None) -> None
     )
     if say is not None and not report.sizes.get("resumed_from_frame"):
         say(spent.line())
+
+
+def _store(
+    scene: Scene, inputs: Inputs, plan: Plan, rows: dict[str, np.ndarray], out: Path, key: str,
+    own: dict[str, np.ndarray],
+) -> None:  # fmt: skip
+    """Write what poses the splats of every frame: labels, rows of the particles, and the rest state."""
+    labels = plan.labels
+    io.save_labels(
+        out / "labels.npz", labels.object_id, labels.votes, labels.confidence, labels.ids, scene=_mark(scene, inputs)
+    )
+    io.save_rows(out / "states", rows, signature=key)
+    store_rest(out / REST_FILE, inputs, plan.dx, own)
+
+
+def _made_before(path: Path) -> dict[str, np.ndarray]:
+    """Splats that an earlier run made for its matter; they are used again where they fit."""
+    if not path.is_file():
+        return {}
+    try:
+        return io.load_arrays(path, "file of a run's rest state", remedy="run the scene again", prefixes=(MADE,))
+    except InputError:  # cut short by a kill: they are made again
+        return {}
+
+
+def _was_torn(scene: Scene, inputs: Inputs, rows: dict[str, np.ndarray], folder: Path, key: str, name: str) -> bool:
+    """Whether an object was torn in a frame; some of them are looked at, the last among them."""
+    if scene.output.states_every != 1:
+        warnings.warn(
+            f'objects.{name}.splats = "auto": its stretch is measured where all states are kept; drawn by the splats of'
+            ' the capture. Set output.states_every = 1, or splats = "own".',
+            stacklevel=2,
+        )
+        return False
+    own = rows["object"] == inputs.ids[name]
+    frames = np.unique(np.linspace(0, scene.simulation.frames, _SHEET_FRAMES).round().astype(int)).tolist()
+    return any(is_torn(io.load_state(folder, frame, signature=key)["F_visual"][own]) for frame in reversed(frames))
 
 
 def _mark(scene: Scene, inputs: Inputs) -> str | None:
@@ -434,6 +481,7 @@ def _draw(
     report: RunReport,
     tell: Progress,
     states: Iterator[int],
+    liquids: Liquids | None,
 ) -> None:
     """Pose and render each saved state, once `states` says that it is there; remove it where it is not to be kept."""
     frames, gaussians = scene.simulation.frames, inputs.gaussians
@@ -445,12 +493,13 @@ def _draw(
         state = io.load_state(out / "states", frame, signature=key)
         there = tuple(np.asarray(state[name], plan.particles.x.dtype) for name in ("x", "F_visual"))
         particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, there)
+        shown, particles = (gaussians, particles) if liquids is None else liquids(gaussians, particles)
         shade = drawn.shade
         if shade is not None and drawn.lit is not None:
-            reached = drawn.lit(gaussians, particles, plan.binding, *shade[:2])
+            reached = drawn.lit(shown, particles, plan.binding, *shade[:2])
             at_rest = reached if at_rest is None else at_rest  # the first frame that is drawn is the rest state
             shade = *shade[:2], reached, at_rest
-        return program()(gaussians, particles, plan.binding, cameras[frame], shade)
+        return program()(shown, particles, plan.binding, cameras[frame], shade)
 
     def program() -> Any:
         """The compiled program; time spent waiting for it counts as compiling."""
