@@ -7,15 +7,18 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.mpm import WALL, Grid
 from pigjax.mpm.colliders import Collider, Contact, Press, Time
-from pigjax.mpm.transfers import Kernel, first_nodes
+from pigjax.mpm.rigid import Holder
+from pigjax.mpm.transfers import Kernel, first_nodes, half_space
 
-# How far off the middle of the matter at a node may be where a body touches a collider [cells]: particles that stand in
-# a lattice are up to 0.12 higher than matter without gaps, and the end of a body is half a cell outside of it.
-_GAP, _ASIDE = 0.15, 0.75
+# Gap at which a body touches a collider [cells]. It is measured by the matter of some cells around, so that a flat face
+# stands as far off the collider, and a ball of three cells' radius sinks in as far.
+_TOUCHES = 0.1
+_EVEN = 1e-3  # differences of gaps that count as none [cells]: a hundred times their rounding in single precision
 
 
 class Bounds(NamedTuple):
@@ -59,7 +62,6 @@ def hold(
     walls: str | None,
     domain: Int[Array, "3"],
     press: Sequence[Press] | None = None,
-    clear: Sequence[Bool[Array, "*b x y z"]] | None = None,
 ) -> Float[Array, "*b x y z 3"]:
     """Velocities of nodes [m/s] after all that holds them.
 
@@ -70,43 +72,98 @@ def hold(
         walls: of the domain; None: as "separate".
         domain: nodes of the domain a side.
         press: how nodes press against each collider, if friction must follow that; None: by their velocity.
-        clear: nodes of matter that does not touch each collider (`clear_of`); None: all touch that are inside.
     """
     for k, (collider, contact) in enumerate(zip(colliders, bounds.contacts)):
-        held = collider.apply(contact, velocity, None if press is None else press[k])
-        velocity = held if clear is None else jnp.where(clear[k][..., None], velocity, held)
+        velocity = collider.apply(contact, velocity, None if press is None else press[k])
+    return hold_at_edges(velocity, bounds, walls, domain)
+
+
+def hold_at_edges(
+    velocity: Float[Array, "*b x y z 3"], bounds: Bounds, walls: str | None, domain: Int[Array, "3"]
+) -> Float[Array, "*b x y z 3"]:
+    """`hold` without colliders."""
     if bounds.frozen is not None:
         velocity = jnp.where(bounds.frozen[..., None], 0.0, velocity)
     return apply_walls(velocity, walls, bounds.places, domain)
 
 
-def clear_of(
-    collider: Collider,
-    *,
-    grid: Grid,
-    nodes: Float[Array, "x y z 3"],
-    middle: Float[Array, "b x y z 3"],
-    time: Time,
-) -> Bool[Array, "b x y z"]:
-    """Nodes whose matter does not reach a collider, though they are in it.
+def smooth(values: Float[Array, "b x y z k"]) -> Float[Array, "b x y z k"]:
+    """Binomial means of three nodes along each axis, which average over the lattice that particles stand in."""
+    for axis in (1, 2, 3):
+        padded = jnp.pad(values, [(1, 1) if k == axis else (0, 0) for k in range(5)])
+        low, mid, high = (lax.slice_in_dim(padded, k, k + values.shape[axis], axis=axis) for k in range(3))
+        values = (low + high) / 4 + mid / 2
+    return values
 
-    The matter in reach of a node begins at the surface of its body. Where that lies on the collider, a node at a depth
-    has the middle of its matter at a known height over the collider: the mean of the B-spline beyond the surface. It is
-    higher where the body curves away, and far aside where the body ends.
+
+class Around(NamedTuple):
+    """Matter of bodies around nodes."""
+
+    nodes: Float[Array, "x y z 3"]  # places in the window [cells]
+    middle: Float[Array, "b x y z 3"]  # by `smooth` masses, in the window [cells]
+    filled: Bool[Array, "b x y z"]  # nodes that matter reaches
+    rigid: Bool[Array, "b 1 1 1"]
+
+
+def holder(
+    collider: Collider,
+    contact: Contact,
+    matter: Around,
+    arms: Float[Array, "b x y z 3"],
+    grid: Grid,
+    kernel: Kernel,
+    dt: Float[Array, ""],
+    time: Time,
+) -> Holder:
+    """A collider that holds rigid bodies where they touch it.
+
+    One that they may leave lets them approach by as much as closes the gap in the step (Stewart 2000, doi
+    10.1137/S0036144599360110); others hold what has none.
 
     Args:
         collider: that the nodes may be in.
+        contact: of the nodes.
+        matter: around them.
+        arms: of the nodes from the centres of mass of the bodies [cells].
         grid: window of nodes.
-        nodes: their places in the window [cells].
-        middle: of each body's matter in reach of the nodes, in the window [cells].
+        kernel: of the transfers.
+        dt: of the step [s].
         time: since the collider was where its numbers say [s].
     """
-    depth = -collider.distance(grid.origin + grid.dx * nodes, time) / grid.dx
-    height = collider.distance(grid.origin + grid.dx * middle, time) / grid.dx
-    touching = jnp.where(depth < 0.5, 0.406 - 0.312 * depth, jnp.maximum(1.5 - depth, 0.0) / 4)
-    apart = middle - nodes
-    aside = (apart**2).sum(-1) - (height + depth) ** 2
-    return (height - touching > _GAP) | (aside > _ASIDE**2)
+    point, gap = _touch(collider, contact, matter, grid, kernel, time)
+    gap = jnp.where(matter.rigid, gap, 0.0)[..., None]
+    closing = gap * grid.dx / dt * contact.normal
+
+    def act(velocity):
+        if collider.mode == "separate":
+            slower = velocity + closing
+            held = collider.apply(contact, slower)
+            return jnp.where(held == slower, velocity, held - closing)  # what it leaves alone is not rounded
+        return jnp.where(gap > 0, velocity, collider.apply(contact, velocity))
+
+    return Holder(act, arms + point - matter.nodes)
+
+
+def _touch(
+    collider: Collider, contact: Contact, matter: Around, grid: Grid, kernel: Kernel, time: Time
+) -> tuple[Float[Array, "b x y z 3"], Float[Array, "b x y z"]]:
+    """Where bodies may touch a collider by the matter around nodes [cells], and how far off they are [cells].
+
+    The point of a node is the middle of the matter around it, moved to the surface of the collider. So the points lie
+    under the matter, and those of a curved body gather under its lowest part, wherever the nodes are. A gap is found by
+    the height of the middle: matter behind a flat face on the collider has a known one. Gaps count from the least one
+    of a body, if that touches.
+    """
+    depth = -collider.distance(grid.origin + grid.dx * matter.nodes, time) / grid.dx
+    height = collider.distance(grid.origin + grid.dx * matter.middle, time) / grid.dx
+    known = half_space(kernel, smoothed=True)
+    depths = jnp.asarray(known.depth, depth.dtype)
+    middles, slopes = (jnp.interp(depth, depths, jnp.asarray(of, depth.dtype)) for of in (known.middle, known.slope))
+    gap = (height - middles) / (1 + slopes)
+    near = matter.filled & (contact.inside > 0)
+    least = jnp.where(near, gap, jnp.inf).min((1, 2, 3), keepdims=True)
+    gap = jnp.maximum(gap - jnp.minimum(least, _TOUCHES) - _EVEN, 0.0)
+    return matter.middle - height[..., None] * contact.normal, jnp.where(near, gap, 0.0)
 
 
 def apply_walls(

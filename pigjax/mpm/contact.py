@@ -10,17 +10,22 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from pigjax.core.arrays import as_array, static_field
 from pigjax.core.checks import Limits, check_fields
 from pigjax.core.errors import InputError
 from pigjax.core.linalg import safe_norm, safe_normalize, safe_ratio
+from pigjax.mpm.transfers import Kernel, half_space
 
 # Distance of the centres of two touching half spaces within a node's reach [cells]: 0.81 at a node on their
 # border, 0.9 half a cell off it (the idea: Nairn and Guilkey 2015, doi 10.1002/nme.4834, sec. 3).
 _TOUCHING = 0.9
 _SHARED = 0.1  # least share of a body in the volume at a node of contact: a smaller one is only the edge of the body
+# Where edges count: that share, and how much farther apart middles may be [cells]. Without it others would press in by
+# a quarter of a cell: an overlap brings middles nearer by only a third of it more than it lowers the bound.
+_SEEN, _EARLY = 1e-3, 0.07
 
 
 def broken_by(integrator: str) -> str | None:
@@ -75,21 +80,40 @@ class BodyContact(eqx.Module):
         return parted + jnp.where(met, missing / jnp.where(sharing > 0, sharing, 1.0), 0.0)
 
 
-def faces(volume: Float[Array, "b x y z 1"], moments: Float[Array, "b x y z 3"]) -> Faces:
-    """Where bodies touch, by the volumes at rest [cells] and Σ w V x of the matter in reach of the nodes [cells]."""
+def faces(volume: Float[Array, "b x y z 1"], moments: Float[Array, "b x y z 3"], edges: Kernel | None = None) -> Faces:
+    """Where bodies touch, by the volumes at rest [cells] and Σ w V x of the matter in reach of the nodes [cells].
+
+    Args:
+        volume: of each body at the nodes.
+        moments: of that.
+        edges: kernel of the transfers if nodes count at which a body has its edge alone: what cannot give way would
+            let others in by a third of a cell before it met them at the rest of the nodes.
+    """
     others = volume.sum(0) - volume
     # The normal points out of the body into the others, where their volume grows by as much as its own falls. Where
     # both change alike their ends lie side by side, and where one changes alone it has an edge: neither tilts the
     # normal. Normals of two bodies are opposite, so that their impulses are too.
     growth, fall = _gradient(others) * volume, -_gradient(volume) * others
-    less = jnp.where(jnp.abs(growth) < jnp.abs(fall), growth, fall)
-    normal = safe_normalize(jnp.where((growth > 0) == (fall > 0), less, 0.0))
+    smaller = jnp.where(jnp.abs(growth) < jnp.abs(fall), growth, fall)
+    normal = safe_normalize(jnp.where((growth > 0) == (fall > 0), smaller, 0.0))
     distance = _middle(moments.sum(0) - moments, others) - _middle(moments, volume)
     gap = (distance * normal).sum(-1, keepdims=True)
     # large where the normal of an edge is not that of the faces
     aside = safe_norm(distance - gap * normal)[..., None]
-    near = (gap < _TOUCHING) & (aside < _TOUCHING) & (jnp.minimum(volume, others) > _SHARED * (volume + others))
+    less, total = jnp.minimum(volume, others), volume + others
+    touching, least = jnp.asarray(_TOUCHING, gap.dtype), _SHARED
+    if edges is not None:
+        touching, least = _touching(edges, less / jnp.where(total > 0, total, 1.0)) + _EARLY, _SEEN
+    near = (gap < touching) & (aside < _TOUCHING) & (less > least * total)
     return Faces(near, normal)
+
+
+def _touching(kernel: Kernel, share: Float[Array, "b x y z 1"]) -> Float[Array, "b x y z 1"]:
+    """Distance of the middles of two half spaces that touch, by the lesser share of them at a node [cells]."""
+    depth, beyond, middle, _ = half_space(kernel)
+    distance = middle + np.interp(-depth, depth, middle)
+    lesser = np.flatnonzero(depth >= 0)[::-1]
+    return jnp.interp(share, *(jnp.asarray(of[lesser], share.dtype) for of in (beyond, distance)))
 
 
 def _middle(moments: Float[Array, "b x y z 3"], volume: Float[Array, "b x y z 1"]) -> Float[Array, "b x y z 3"]:

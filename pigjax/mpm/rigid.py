@@ -94,12 +94,19 @@ class Nodes(NamedTuple):
         return some._replace(weight=jnp.where(real[:, None, None, None], some.weight, 0.0))
 
 
+class Holder(NamedTuple):
+    """What holds rigid bodies."""
+
+    act: Callable[[Velocities], Velocities]  # on the velocities where they touch it
+    arms: Velocities  # of these places from the centres of mass of the bodies [cells]
+
+
 class Meeting(NamedTuple):
     """Contact of bodies, as functions of arrays at some nodes or all."""
 
     part: Callable[[Velocities, Masses, Any], Velocities] | None  # from each other, by `faces`; None: there is one
-    hold: Callable[[Velocities, Any, Any], Velocities]  # by `bounds`, but where rigid bodies are `clear`, if not None
-    clear: Callable[[Any, Any], Any]  # where they are, by `faces` and `bounds`
+    hold: Callable[[Velocities, Any], Velocities]  # all that holds bodies which are not rigid, by `bounds`
+    holders: Callable[[Nodes], tuple[Holder, ...]]  # of rigid bodies
 
 
 def rigid_velocities(
@@ -149,7 +156,7 @@ def rigid_velocities(
         return solve(nodes)
 
     once = velocity if contact.part is None else contact.part(velocity, mass, faces)
-    once = contact.hold(once, bounds, None)
+    once = contact.hold(once, bounds)
     after, moving, spin = at_all() if few >= met.size else lax.cond(met.sum() <= few, at_some, at_all)
     velocity = jnp.where(met[..., None], after, once)
     gradient = _turning(bodies, spin, cells)
@@ -167,7 +174,7 @@ def _solve(
 ) -> tuple[Velocities, Float[Array, "b 3"], Float[Array, "b 3"]]:
     """Velocities of the nodes, and velocities and spins of the rigid bodies after all rounds."""
     bodies = bodies._replace(arms=nodes.arms)
-    clear = contact.clear(nodes.faces, nodes.bounds)
+    holders = contact.holders(nodes)
 
     @jax.checkpoint
     def visit(_, carry):
@@ -177,17 +184,20 @@ def _solve(
             velocity = contact.part(before, nodes.weight, nodes.faces)
             faster, turned = bodies.motion(jnp.where(stiff, nodes.weight * (velocity - before), 0.0))
             moving, spin = moving + faster, spin + turned
-        before = jnp.where(stiff, bodies.field(moving, spin), velocity)
-        velocity = contact.hold(before, nodes.bounds, clear)
-        change = jnp.where(stiff, velocity - before, 0.0)
-        faster, turned = bodies.motion(nodes.weight * change)
-        # No other body takes part, so that this one may take as much as brings its nodes nearest to their change.
-        answer = bodies.field(faster, turned)
-        acts = nodes.weight * (change != 0).any(-1, keepdims=True)
-        suits, whole = ((acts * other * answer).sum((1, 2, 3, 4)) for other in (change, answer))
-        some = whole > jnp.finfo(whole.dtype).tiny ** 0.5
-        more = jnp.where(some, suits / jnp.where(some, whole, 1.0), 1.0)[:, None]
-        return velocity, moving + more * faster, spin + more * turned
+        for holder in holders:
+            there = bodies._replace(arms=holder.arms)
+            before = jnp.where(stiff, there.field(moving, spin), velocity)
+            velocity = holder.act(before)
+            change = jnp.where(stiff, velocity - before, 0.0)
+            faster, turned = there.motion(nodes.weight * change)
+            # No other body takes part: this one may take as much as brings its matter nearest to its change.
+            answer = there.field(faster, turned)
+            acts = nodes.weight * (change != 0).any(-1, keepdims=True)
+            suits, whole = ((acts * other * answer).sum((1, 2, 3, 4)) for other in (change, answer))
+            some = whole > jnp.finfo(whole.dtype).tiny ** 0.5
+            more = jnp.where(some, suits / jnp.where(some, whole, 1.0), 1.0)[:, None]
+            moving, spin = moving + more * faster, spin + more * turned
+        return velocity, moving, spin
 
     return lax.fori_loop(0, rounds, visit, (nodes.velocity, *motion))
 

@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.mpm import WALL, Grid, State, StepHealth
-from pigjax.mpm.boundaries import Bounds, clear_of, hold, places_of
+from pigjax.mpm.boundaries import Around, Bounds, hold, hold_at_edges, holder, places_of, smooth
 from pigjax.mpm.by_law import by_component, by_row
 from pigjax.mpm.chunked import ChunkLoop, gather_chunks, scatter_chunks
 from pigjax.mpm.colliders import Collider, Contact, Press, Time
@@ -29,7 +29,7 @@ from pigjax.mpm.forces import Force, Matter
 from pigjax.mpm.health import LaneHealth
 from pigjax.mpm.materials import Parameters, respond
 from pigjax.mpm.materials.tensors import determinant, product
-from pigjax.mpm.rigid import Meeting, rigid_velocities
+from pigjax.mpm.rigid import Holder, Meeting, rigid_velocities
 from pigjax.mpm.transfers import (
     CHANNELS,
     Kernel,
@@ -468,7 +468,9 @@ def _separate_bodies(
     """Velocities after contact between bodies."""
     assert context.body_contact is not None
     mass = nodes.reshape(context.bodies, *context.grid.shape, 4)[..., :1] / context.unit_mass
-    return context.body_contact.part(velocity, mass, _faces(context, nodes, _moments(statics, context, states)))
+    return context.body_contact.part(
+        velocity, mass, _faces(statics, context, nodes, _moments(statics, context, states))
+    )
 
 
 def _moments(statics: StepStatics, context: StepContext, states: tuple[State, ...]) -> Float[Array, "b x y z 3"]:
@@ -484,11 +486,14 @@ def _moments(statics: StepStatics, context: StepContext, states: tuple[State, ..
     return moment.reshape(context.bodies, *context.grid.shape, 4)[..., 1:]
 
 
-def _faces(context: StepContext, nodes: Float[Array, "n y z 4"], moments: Float[Array, "b x y z 3"]) -> Faces:
+def _faces(
+    statics: StepStatics, context: StepContext, nodes: Float[Array, "n y z 4"], moments: Float[Array, "b x y z 3"]
+) -> Faces:
     """Where bodies touch."""
     assert context.specific_volume is not None
     specific = context.specific_volume[:, None, None, None, None]
-    return faces(specific * nodes.reshape(*moments.shape[:-1], 4)[..., :1], specific * moments)
+    edges = None if context.rigid is None else statics.kernel
+    return faces(specific * nodes.reshape(*moments.shape[:-1], 4)[..., :1], specific * moments, edges)
 
 
 def _rigid_step(
@@ -508,24 +513,30 @@ def _rigid_step(
     places = places_of(context.grid.shape, context.low)
     bounds = Bounds(tuple(_contacts(context, time)), context.frozen, places).at_all(context.grid.shape)
     meets, moments = bounds.holds(context.domain)[..., None], _moments(statics, context, states)
-    between = None if context.body_contact is None else _faces(context, nodes, moments)
+    between = None if context.body_contact is None else _faces(statics, context, nodes, moments)
     meets = meets if between is None else meets | between.near
-    middle = moments / jnp.where(filled, nodes.reshape(*apart, 4)[..., :1], 1.0)
+    around = smooth(nodes.reshape(*apart, 4)[..., :1])
+    middle = smooth(moments) / jnp.where(around > 0, around, 1.0)
     stiff = context.rigid[:, None, None, None]
 
     def part(velocity, mass, own):
         assert context.body_contact is not None
         return context.body_contact.part(velocity, mass, own[0])
 
-    def hold_all(velocity, bounds, clear):
-        return hold(velocity, context.colliders, bounds, statics.walls, context.domain, clear=clear)
+    def hold_all(velocity, bounds):
+        return hold(velocity, context.colliders, bounds, statics.walls, context.domain)
 
-    def clear(own, bounds):
-        at = (jnp.stack(bounds.places, -1) - context.low).astype(velocity.dtype)
-        found = partial(clear_of, grid=context.grid, nodes=at, middle=own[1], time=time)
-        return tuple(stiff & found(collider) for collider in context.colliders)
+    def holders(nodes):
+        at = (jnp.stack(nodes.bounds.places, -1) - context.low).astype(velocity.dtype)
+        matter = Around(at, nodes.faces[1], nodes.weight[..., 0] > 0, stiff)
+        found = [
+            holder(collider, contact, matter, nodes.arms, context.grid, statics.kernel, context.dt, time)
+            for collider, contact in zip(context.colliders, nodes.bounds.contacts)
+        ]
+        edges = partial(hold_at_edges, bounds=nodes.bounds, walls=statics.walls, domain=context.domain)
+        return (*found, Holder(edges, nodes.arms))
 
-    contact = Meeting(None if between is None else part, hold_all, clear)
+    contact = Meeting(None if between is None else part, hold_all, holders)
     cells = context.dt / context.grid.dx
     return rigid_velocities(
         context.rigid, mass, velocity, filled & meets, contact, (between, middle), bounds, cells,

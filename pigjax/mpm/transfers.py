@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -63,6 +63,34 @@ KERNELS = {
     "quadratic": Kernel((-1, 0, 1), _quadratic, _quadratic_slopes, 4.0, nearest=True),
     "cubic": Kernel((-1, 0, 1, 2), _cubic, _cubic_slopes, 3.0, nearest=False),
 }
+
+
+class HalfSpace(NamedTuple):
+    """Matter beyond a face, as a node sees it by its depth before the face [cells]."""
+
+    depth: np.ndarray
+    share: np.ndarray  # of the node's matter, if there were no face
+    middle: np.ndarray  # of the matter, beyond the face [cells]
+    slope: np.ndarray  # of the middle by depth
+
+
+@lru_cache
+def half_space(kernel: Kernel, smoothed: bool = False) -> HalfSpace:
+    """Numbers of a half space; `smoothed` nodes are binomial means of three."""
+    fine = 1000
+    at = (np.arange(fine) + 0.5) / fine - (0.5 if kernel.nearest else 0.0)
+    weights: list[Any] = kernel.weights(at)  # type: ignore[arg-type]  # NumPy's in, NumPy's out
+    spline = np.concatenate([weight[::-1] for weight in weights])  # by place from the node
+    start = kernel.offsets[0] - at[-1]
+    places = start - 1 + np.arange(len(spline) + 2 * fine) / fine
+    shares = (0.25, 0.5, 0.25) if smoothed else (0.0, 1.0, 0.0)
+    padded = [share * np.pad(spline, (k * fine, (2 - k) * fine)) for k, share in enumerate(shares)]
+    whole = np.sum(padded, 0) / fine
+    reach = np.flatnonzero(whole)[[0, -1]]
+    places, whole = places[reach[0] : reach[1] + 1], whole[reach[0] : reach[1] + 1]
+    beyond, moment = (np.cumsum(part[::-1])[::-1] for part in (whole, whole * places))
+    middle = moment / beyond - places
+    return HalfSpace(*(part[:-50:50] for part in (places, beyond, middle, np.gradient(middle, places))))
 
 
 def no_fuse(opaque_true: Bool[Array, ""], function: Callable, *args: Any) -> Any:

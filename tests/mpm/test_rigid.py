@@ -112,10 +112,10 @@ def test_the_nodes_in_contact_alone_give_what_all_nodes_give(monkeypatch, x64):
         monkeypatch.setattr(rigid, "_SHARE", 10**6)
         contact = BodyContact(bodies=2, friction=0.3)
 
-        def hold(velocity, bounds, clear):
+        def hold(velocity, bounds=None):
             return velocity.at[0, ..., 2].max(-0.1)
 
-        meeting = rigid.Meeting(contact.part, hold, lambda faces, bounds: None)
+        meeting = rigid.Meeting(contact.part, hold, lambda nodes: (rigid.Holder(hold, nodes.arms),))
         which, faces = jnp.asarray([True, False]), Faces(near, normal)
         return rigid.rigid_velocities(which, mass, velocity, near, meeting, faces, (), jnp.asarray(0.01), 20)
 
@@ -129,9 +129,9 @@ def test_the_nodes_in_contact_alone_give_what_all_nodes_give(monkeypatch, x64):
 @pytest.mark.slow
 def test_a_tumbling_brick_keeps_its_angular_momentum_and_its_energy(x64):
     """About the middle axis, where the free motion is unstable; explicit Euler would gain energy."""
-    particles, table = matter((lattice((0.3, 0.2, 0.1), (0.35, 0.25, 0.3)), 0))
+    particles, table = matter((lattice((0.3, 0.2, 0.1), (0.35, 0.4, 0.45)), 0))
     particles = moving(particles, [(0.0, 0, 0)], [(0.1, 20.0, 0.1)])
-    end, _ = run(particles, table, nodes=(20, 14, 14), steps=250)
+    end, _ = run(particles, table, nodes=(20, 20, 20), steps=250)
     (_, before), (_, after) = momenta(particles), momenta(end)
     np.testing.assert_allclose(after, before, rtol=1e-9, atol=1e-12)
     energy = [float((p.mass * (p.v**2).sum(1)).sum() / 2) for p in (particles, end)]
@@ -160,33 +160,59 @@ def test_a_block_slides_down_an_incline_as_coulomb_says(friction, angle):
     assert abs(went[2]) < 0.1 * DX
 
 
-@pytest.mark.slow
-def test_a_ball_rolls_down_an_incline_and_turns_as_it_goes():
-    """(5/7) g sin θ, less what it takes to roll over cells: a third at three cells a radius, here."""
-    radius, time, slope = 0.15, 0.3, math.radians(15)
-    golden, shells = math.pi * (3 - math.sqrt(5)), []
-    for r in (np.arange(round(radius / DX * 2)) + 0.5) * DX / 2:  # a lattice would have flat faces, on which it rests
+def shells(radius):
+    """A ball whose surface is as even as its particles allow."""
+    golden, found = math.pi * (3 - math.sqrt(5)), []
+    for r in (np.arange(round(radius / DX * 2)) + 0.5) * DX / 2:
         k = np.arange(round(4 * math.pi * (r / DX * 2) ** 2)) + 0.5
         z = 1 - 2 * k / len(k)
         wide = np.sqrt(1 - z**2)
-        shells.append(r * np.stack([wide * np.cos(golden * k), wide * np.sin(golden * k), z], -1))
-    ball = np.concatenate(shells) + np.array([0.22 + radius, 0.22 + radius, FLOOR + radius])
-    particles, table = matter((ball, 0))
-    nodes = (20, 17, 17)  # no wall in reach
+        found.append(r * np.stack([wide * np.cos(golden * k), wide * np.sin(golden * k), z], -1))
+    return np.concatenate(found)
+
+
+def cut_out(radius):
+    """A ball cut out of a lattice that is turned against the floor."""
+    side = 2 * radius + 2 * DX
+    points = lattice((side, side, side), (-side / 2,) * 3)
+    points = points[np.linalg.norm(points, axis=1) < radius]
+    return points @ np.asarray(rigid.rotation_less_one(jnp.asarray([[0.3, 0.5, 0.2]]))[0] + np.eye(3)).T
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("ball", "cells", "aside", "least"),
+    [
+        (shells, 3, 0.0, 0.86),
+        (shells, 3, 0.5, 0.86),
+        (shells, 4, 0.3, 0.86),
+        (cut_out, 3, 0.3, 0.7),
+        (cut_out, 4, 0, 0.7),
+    ],
+)
+def test_a_ball_rolls_down_an_incline_and_turns_as_it_goes(ball, cells, aside, least):
+    """(5/7) g sin θ over four cells, from rest; the surface is uneven by a hundredth of a cell."""
+    radius, time, slope = cells * DX, 0.48, math.radians(15)
+    low = 4.4 * DX
+    points = ball(radius) + np.array([low + radius + aside * DX, low + radius, FLOOR + radius])
+    particles, table = matter((points, 0))
+    nodes = tuple(math.ceil(2 * cells + more) for more in (15, 11, 11))  # no wall in reach
     settled, _ = run(particles, table, nodes=nodes, steps=75, gravity=(0.0, 0.0, -9.81), floor=1.0)
+    end = eqx.tree_at(lambda p: (p.v, p.C), settled, (0 * settled.v, 0 * settled.C))
     gravity = (9.81 * math.sin(slope), 0.0, -9.81 * math.cos(slope))
-    end = settled
     for _ in range(round(time / STEP / 75)):
         end, _ = run(end, table, nodes=nodes, steps=75, gravity=gravity, floor=1.0)
-    went = middle(end) - middle(settled)
+    went, height = middle(end) - middle(settled), middle(end)[2] - FLOOR
     spin = float(end.C[0, 0, 2] - end.C[0, 2, 0]) / 2
-    speed = float(end.v[:, 0].mean())
+    arm = float(end.v[:, 0].mean()) / spin
     wanted = 5 / 7 * 9.81 * math.sin(slope) * time**2 / 2
     print(
-        f"rolled {went[0]:.4f} m, wanted {wanted:.4f}; {speed:.3f} m/s at {spin:.2f} rad/s: radius {speed / spin:.3f} m"
+        f"{ball.__name__}, {cells} cells: rolled {went[0]:.4f} m, wanted {wanted:.4f}, ratio {went[0] / wanted:.3f}; "
+        f"aside {went[1]:.4f}; middle {height / DX:.2f} cells high, turns about {arm / DX:.2f}"
     )
-    assert 0.65 * wanted < went[0] < 1.05 * wanted
-    assert radius < speed / spin < radius + 1.5 * DX
+    # the push passes from node to node in steps of half a cell, each of which costs speed as the edge of a wheel does
+    assert least * wanted < went[0] < 1.03 * wanted
+    assert arm == pytest.approx(height, rel=0.03)  # it rolls on the floor, without slip
 
 
 @pytest.mark.slow
@@ -251,11 +277,9 @@ def test_a_wooden_block_floats_as_deep_as_it_is_dense():
     body, states = np.asarray(particles.body), np.asarray(path.x)[-25:]
     bottom = states[:, body == 1, 2].mean() - size[2] / 2
     levels = []
-    for x in states[:, body == 0]:  # the highest particles of the columns of cells that are apart from the block
-        columns = np.floor((x[:, :2] - low) / DX).clip(0, 11).astype(int)
-        tops = np.zeros((12, 12))
-        np.maximum.at(tops, tuple(columns.T), x[:, 2])
-        levels.append(np.r_[tops[:2].ravel(), tops[-2:].ravel()].mean() + DX / 4)
+    for x in states[:, body == 0]:  # the volume of columns of cells that are apart from the block and the walls
+        apart = (np.abs(np.abs(x[:, 0] - low - side / 2) - 0.2) < DX / 2) & (np.abs(x[:, 1] - low - side / 2) < 0.25)
+        levels.append(x[:, 2].min() - DX / 4 + apart.sum() * (DX / 2) ** 3 / (2 * DX * 0.5))
     sunk = np.mean(levels) - bottom
     print(f"{sunk / size[2]:.3f} of the block under water, wanted 0.6; level {np.mean(levels):.3f} m")
     assert sunk / size[2] == pytest.approx(0.6, rel=0.05)
