@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.common.pages import ROOT, head, row
-from pigjax.cli.viewer.opened import Opened, open_path
+from pigjax.cli.viewer.opened import Opened, _plain_labels, open_path
 from pigjax.cli.viewer.session import Session
+from pigjax.scene.plan import Inputs
 from pigjax.splat import Gaussians
 
 HEAD = ("scene", "splats", "moving", "particles", "steps per frame", "simulate s", "draw s", "frames/s",
@@ -57,7 +58,9 @@ def ball(count: int, cells: float) -> Session:
         "planes": {"floor": {"point": [0, 0, 0], "normal": [0, 0, 1]}},
     }
     here = Path()
-    return Session(Opened("ball", here, cloud, np.ones(count, np.int32), {1: "ball"}, values, here))
+    ids, names = np.ones(count, np.int32), {1: "ball"}
+    read = Inputs(cloud, None, {"ball": 1}, names)  # there is no file
+    return Session(Opened("ball", here, cloud, ids, names, values, here, read=read, labels=_plain_labels(ids)))
 
 
 def scenes(options):
