@@ -53,7 +53,7 @@ def simulate(
         material=np.arange(len(x)) % len(laws),
     )  # fmt: skip
     plane = Plane(
-        point=jnp.asarray([0.0, 0.0, 0.48]), normal=numbers["normal"], friction=numbers["friction"], mode=mode,
+        point=jnp.asarray([0.6, 0.6, 0.52]), normal=numbers["normal"], friction=numbers["friction"], mode=mode,
         softness=softness,
     )  # fmt: skip
     settings = SimConfig(**{"substeps": steps, "devices": 1} | ROADS[road] | config)
