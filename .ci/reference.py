@@ -63,7 +63,7 @@ def comments_of(kind: type) -> dict[str, str]:
 
 def meaning_of(kind: type, name: str) -> str:
     """Comment of a field where the class or the nearest base defines it; of a material's number that of the laws."""
-    if kind is ObjectSpec and name in LIMITS:
+    if issubclass(kind, ObjectSpec) and name in LIMITS:
         kind = Parameters
     told = next((own[name] for base in kind.__mro__ if Section in base.__mro__ or base is Parameters
                  if name in (own := comments_of(base))), "")  # fmt: skip
@@ -73,7 +73,7 @@ def meaning_of(kind: type, name: str) -> str:
 def rows_of(kind: type[Section]) -> Iterator[Row]:
     """Fields of a section that hold values, in the order of the code."""
     limits = {name: limit for name, _, limit in numbers_of(kind)}
-    if kind is ObjectSpec:
+    if issubclass(kind, ObjectSpec):
         limits |= {name: limit for name, (_, limit) in LIMITS.items() if name in limits}
     for field in fields(kind):
         if field.name in FROM_OUTSIDE:
@@ -83,9 +83,9 @@ def rows_of(kind: type[Section]) -> Iterator[Row]:
         unit, bounds = ("", "") if limit is None else (limit.unit, _range(limit))
         if not unit and meaning.endswith("]") and "[" in meaning:  # "[m]" at the end of a comment
             meaning, _, unit = meaning[:-1].rpartition(" [")
-        if kind is ObjectSpec and field.name in LIMITS and meaning.endswith(f" [{unit}]"):
+        if issubclass(kind, ObjectSpec) and field.name in LIMITS and meaning.endswith(f" [{unit}]"):
             meaning = meaning.removesuffix(f" [{unit}]")
-        default = "of the material" if kind is ObjectSpec and field.name in LIMITS else _default(field)
+        default = "of the material" if issubclass(kind, ObjectSpec) and field.name in LIMITS else _default(field)
         yield Row(field.name, _type(field.type), default, unit, bounds, meaning)
 
 
@@ -272,8 +272,8 @@ REAL = {
     "rubber": ("soft silicone; tyres are ten times as stiff", "930 to 1200", "E 0.1 to 10 MPa", "ν 0.49 to 0.5"),
     "muscle": ("skeletal muscle, stretched passively", "1060", "E 5 to 50 kPa across, 20 to 300 kPa along", ""),
     "metal": ("aluminium", "2700", "E 69 GPa", "yields at 30 to 300 MPa"),
-    "steel": ("structural steel", "7850", "E 200 GPa", "yields at 250 MPa and more, which the preset leaves out"),
-    "stone": ("granite", "2600 to 2700", "E 40 to 70 GPa", "breaks, which the preset leaves out"),
+    "steel": ("structural steel", "7850", "E 200 GPa", "yields at 250 MPa and more; the preset does not yield"),
+    "stone": ("granite", "2600 to 2700", "E 40 to 70 GPa", "breaks; the preset does not, but see `tearing_stretch`"),
     "plasticine": ("play dough; plasticine at 20 °C yields at 50 kPa and more", "1200 to 1800", "E 0.1 to 5 MPa",
                    "yields at a few kPa"),
     "sand": ("dry sand", "1500 to 1700", "E 10 to 80 MPa", "friction angle 30° to 40°"),
@@ -379,7 +379,7 @@ Real aluminium has 69 GPa and real steel 200 GPa; the preset `metal` has 5 MPa. 
 What this means:
 
 - Weight, friction, flow and shape at rest are those of the named matter. The pitch of vibrations, the duration of an impact and the depth of a dent in `metal` are not: it does not tell forces or stresses of a real part.
-- `steel` and `stone` keep the real moduli. They need `simulation.integrator = "implicit"` or slow motion. An object that need not deform is cheaper as `fixed = true`, or as a collider with a velocity.
+- `steel` and `stone` keep the real moduli. They need `simulation.integrator = "implicit"` or slow motion. An object that need not deform is cheaper as `rigid = true`, which takes its density alone, or as `fixed = true` where it stands still.
 - The `bulk_modulus` of water only has to keep it from being squeezed visibly: waves should be ten times as fast as the flow (Monaghan 1994). The preset's 14 m/s serve flows of up to about 1.4 m/s, that is falls of 10 cm. For higher falls raise it with the square of the speed.
 - To fit numbers to a real object, tune them against its video: [studies](STUDIES.md). Only E/ρ can be seen in a video without known forces."""  # noqa: E501
 

@@ -18,6 +18,8 @@ from pigjax.scene import load_scene, run_scene
 SCENES = {path.stem: path for path in sorted((EXAMPLES / "materials").glob("*.toml"))}
 SHEET, TILE = (6, (184, 138)), (208, 156)  # pictures a clip and their size; size in the animation
 PLAYED = 28  # pictures of the animation
+CLIP = EXAMPLES / "gallery" / "cup.toml"
+LARGEST = 5_000_000  # bytes of the first screen's animation
 HEADER = head("scene", "s", "stages: run + compile [s]", "particles", "frames", "substeps", "least J", "notes")
 
 
@@ -42,9 +44,41 @@ def tabletop(options) -> None:
     write_video(options.media / "tabletop.gif", small, fps=12)
 
 
-def run(scene: Path, folder: Path) -> str:
+def clip(options) -> None:
+    """Run the scene of the first screen at `--scale` times 1280 x 720, and write its animation."""
+    print(HEADER)
+    size = {"camera": {"width": 1280, "height": 720}, "drawing": {"scale": options.scale}}
+    print(run(CLIP, options.out / "clip", size))
+    frames = iio.imread(options.out / "clip" / "video.mp4")
+    colours, step, written = write_clip(options.media / "clip.gif", frames, fps=24)
+    print(f"\n{len(frames[::step])} pictures of {colours} colours, {written / 1e6:.1f} MB")
+
+
+def write_clip(path: Path, frames: np.ndarray, *, fps: float) -> tuple[int, int, int]:
+    """An animation of at most 5 MB: as many colours and pictures as fit.
+
+    Args:
+        path: of the file.
+        frames: of the video.
+        fps: of the video.
+
+    Returns:
+        Colours, frames from one picture to the next, and bytes.
+    """
+    for step, colours in ((1, 256), (1, 128), (2, 128), (2, 64), (3, 64), (3, 32), (4, 32)):
+        pictures = [Image.fromarray(frame) for frame in frames[::step]]
+        palette = few_colours(pictures[len(pictures) // 2], colours)
+        pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+        rest = pictures[1:]
+        pictures[0].save(path, save_all=True, append_images=rest, duration=1e3 * step / fps, loop=0, optimize=True)
+        if path.stat().st_size <= LARGEST:
+            break
+    return colours, step, path.stat().st_size
+
+
+def run(scene: Path, folder: Path, changes: dict | None = None) -> str:
     """Run a scene into a folder; a line of the table."""
-    seconds, report = clock(lambda: run_scene(load_scene(scene), folder))
+    seconds, report = clock(lambda: run_scene(load_scene(scene, changes=changes), folder))
     stages = ", ".join(f"{stage} {spent.run:.1f} + {spent.compile:.1f}" for stage, spent in report.times.items())
     sizes = [report.sizes[name] for name in ("particles", "frames", "substeps_per_frame")]
     least = f"{report.health['min_J']:.3f}" if "min_J" in report.health else ""
@@ -85,9 +119,10 @@ def few_colours(picture: Image.Image, count: int) -> Image.Image:
     return picture.quantize(count, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
 
 
-PARTS = {"materials": ("Materials", materials), "tabletop": ("Tabletop", tabletop)}
+PARTS = {"materials": ("Materials", materials), "tabletop": ("Tabletop", tabletop), "clip": ("First screen", clip)}
 OPTIONS = {
     "scenes": {"nargs": "+", "default": list(SCENES), "choices": SCENES, "help": "of part materials"},
     "out": {"type": Path, "default": ROOT / "out" / "materials", "help": "folder of all results"},
+    "scale": {"type": float, "default": 1.0, "help": "of the pictures of part clip"},
 }
 DEVICES = None

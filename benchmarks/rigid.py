@@ -4,7 +4,6 @@ rounds: a box falls tilted onto a floor, with few rounds of contact and with man
 cost: water alone, with a block of jelly in one velocity field and apart from it, and with a rigid block.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -98,7 +97,6 @@ def _afloat(cells, block, apart):
     grid = Grid(jnp.zeros(3), jnp.asarray(dx), (cells + 7, cells + 7, cells + 7))
     contact = BodyContact(bodies=2, friction=0.3) if apart else None
 
-    @jax.jit
     def run():
         config = SimConfig(substeps=STEPS, devices=1, walls="separate", force=True)
         return rollout(

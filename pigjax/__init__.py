@@ -16,8 +16,10 @@ from pigjax.core.upright import Upright, find_up
 from pigjax.coupling.binding import at_frame, bind, deform
 from pigjax.coupling.hidden import fill_hidden
 from pigjax.coupling.outliers import cut_outliers
+from pigjax.coupling.own_splats import OwnSplats, make_own_splats
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
+from pigjax.coupling.vessel import vessel_from_gaussians
 from pigjax.io import (
     Views,
     example_folder,
@@ -60,6 +62,7 @@ from pigjax.splat import (
     required_capacity,
     surface_depth,
 )
+from pigjax.splatting.shadows import Light, cast_shadows, light_transmittance
 from pigjax.study import Experiment, experiment, load_study, sweep_study, tune_study
 from pigjax.study.optimize import Bounds, Table, fit, load_table, search, sweep
 
@@ -85,9 +88,11 @@ __all__ = [
     "Impulse",
     "InputError",
     "Labels",
+    "Light",
     "Material",
     "MaterialTable",
     "MissingFileError",
+    "OwnSplats",
     "Particles",
     "Plane",
     "RenderConfig",
@@ -114,6 +119,7 @@ __all__ = [
     "at_frame",
     "bind",
     "boundary_iou",
+    "cast_shadows",
     "choose_box",
     "choose_integrator",
     "choose_substeps",
@@ -138,6 +144,7 @@ __all__ = [
     "hole_mask",
     "interpolate_path",
     "lift_masks",
+    "light_transmittance",
     "load_dataset",
     "load_gaussians",
     "load_masks",
@@ -149,6 +156,7 @@ __all__ = [
     "load_table",
     "load_views",
     "look_at",
+    "make_own_splats",
     "make_particles",
     "material_table",
     "mean_iou",
@@ -184,6 +192,7 @@ __all__ = [
     "sweep_study",
     "tune_study",
     "vast_grid",
+    "vessel_from_gaussians",
     "write_video",
 ]
 

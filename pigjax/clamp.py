@@ -115,6 +115,33 @@ def clamped_shapes(
     return factors, polar(F)[0] if coloured and mode != "fixed" else None
 
 
+def held_deformation(
+    F: Float[Array, "c 3 3"], params: ClampParams
+) -> tuple[Float[Array, "c 3 3"], Float[Array, "c 3 3"], Float[Array, "c"]]:
+    """Deformation gradients with their change of size and their change of shape each held within the bounds.
+
+    F = U S Vᵀ has the mean stretch j = |det F|^(1/3). Both j and the stretches S / j, whose product stays 1, are held
+    between tau_min and tau_max, and so is each stretch: a splat keeps the volume of its particle where that can be.
+    Bounds in metres (`relative` false) do not apply to a deformation: 0.5 and 2 stand for them.
+
+    Args:
+        F: deformation gradient of each particle.
+        params: bounds; the weights do not count.
+
+    Returns:
+        The held deformations, the rotations U Vᵀ, and the largest held stretch of each.
+    """
+    low, high = (params.tau_min, params.tau_max) if params.relative else (0.5, 2.0)
+    low, high = jnp.minimum(low, 1.0), jnp.maximum(high, 1.0)
+    u, stretch, v = svd(F)
+    stretch = jnp.maximum(jnp.abs(stretch), _SMALLEST_FRACTION)
+    size = jnp.cbrt(stretch.prod(-1, keepdims=True))
+    shape = jnp.clip(stretch / size, low, high)
+    held = jnp.clip(jnp.clip(size, low, high) * shape / jnp.cbrt(shape.prod(-1, keepdims=True)), low, high)
+    turned = jnp.swapaxes(v, -1, -2)
+    return matmul3(u * held[:, None, :], turned), matmul3(u, turned), held.max(-1)
+
+
 def _aligned(rotation, scales, F, params):
     carried = matmul3(polar(F)[0], rotation)
     axes, stretched, _ = aligned_svd(matmul3(F, rotation * scales[:, None, :]))

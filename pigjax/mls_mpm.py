@@ -42,7 +42,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import is_known
+from pigjax.core.arrays import is_compiling, is_known
 from pigjax.core.errors import InputError
 from pigjax.core.regions import Region
 from pigjax.mpm import Grid, Health, Particles, SimConfig, StepHealth, Trajectory
@@ -121,7 +121,7 @@ def step(
     check_gravity(gravity)
     if is_known(dt) and not 0 <= float(dt) < math.inf:
         raise InputError(f"dt = {float(dt)}: a step must be >= 0 s, and finite.")
-    if is_known(particles, grid, table, dt, gravity, colliders, contact, pins, forces):
+    if is_known(particles, grid, table, dt, gravity, colliders, contact, pins, forces) and not is_compiling():
         if config.integrator == "auto":
             explicit = replace(config, integrator="explicit")
             is_stable = float(dt) <= longest_step(float(dt), particles, grid, table, explicit, colliders)[0]
@@ -188,7 +188,7 @@ def rollout(
     check_forces(forces, len(particles))
     check_steps(frames, frame_dt, gravity)
     shared = (particles, grid, table, frame_dt, gravity, colliders, contact, pins, forces)
-    if not is_known(shared):
+    if not is_known(shared) or is_compiling():
         if sleep is not None:
             raise InputError(
                 "rollout is traced by jit, grad or vmap, where it cannot be decided who sleeps: give sleep=None there."

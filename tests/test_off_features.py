@@ -8,7 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import ball
 
+from pigjax.core.camera import look_at
 from pigjax.core.regions import HalfSpace
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, group_by_law, make_particles
@@ -16,6 +18,10 @@ from pigjax.mpm.colliders import Plane
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.forces import ForceField, Spring, Wind
 from pigjax.mpm.materials import LAWS, Material, Parameters, material_table, respond
+from pigjax.scene.run import shaded_picture
+from pigjax.splat import RenderConfig
+from pigjax.splatting.shadows import Light
+from pigjax.splatting.types import as_splats
 
 DX = 1 / 8
 DOMAIN = Grid(jnp.zeros(3), jnp.asarray(DX), (10, 11, 12))
@@ -210,3 +216,19 @@ def test_matter_carries_only_the_state_that_its_law_has():
         assert (state.hardening is not None) == LAWS[law].hardens, law
         assert (state.visual is not None) == (not LAWS[law].total), law
         assert state.row is None
+
+
+def test_a_picture_without_a_light_traces_no_shadows(monkeypatch):
+    gaussians = ball(20)
+    splats = as_splats(gaussians)
+    camera = look_at(np.array([1.0, 0, 0.3]), np.array([0.0, 0, 0.3]), focal=20.0, width=16, height=16)
+
+    def drawn(gaussians, splats, shade):
+        return shaded_picture(gaussians, splats, camera, shade, RenderConfig(), jnp.ones(3))
+
+    shade = jnp.ones(20, bool), Light(direction=(0.0, 0.0, -1.0)), jnp.ones(20), jnp.ones(20)
+    on = primitives(jax.make_jaxpr(drawn)(gaussians, splats, shade))
+    monkeypatch.setattr("pigjax.scene.run.cast_shadows", None)  # calling it would fail
+    off = primitives(jax.make_jaxpr(drawn)(gaussians, splats, None))
+    assert on.total() > off.total()
+    assert not {name for name in off if off[name] > on[name]}

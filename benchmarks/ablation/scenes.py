@@ -39,7 +39,7 @@ class Subject(NamedTuple):
 def subjects(names: tuple[str, ...]) -> list[Subject]:
     """The scenes by name: bent, pressed, drawn."""
     needed = {"bent": "soccerball", "pressed": "duck"}
-    objects = _objects([needed[name] for name in names if name in needed])
+    objects = cut_out([needed[name] for name in names if name in needed])
     made = {"bent": lambda: bent(objects["soccerball"]), "pressed": lambda: pressed(objects["duck"]), "drawn": drawn}
     return [made[name]() for name in names]
 
@@ -52,7 +52,7 @@ def bent(ball: pj.Gaussians) -> Subject:
         u = (x - middle) / radius
         angle = 0.35 * u[2]
         shifted = jnp.stack([u[0] + 0.25 * u[2] ** 2, u[1] * (1 + 0.15 * u[0]), u[2] * (1 - 0.15 * u[0])])
-        return middle + radius * (_turn(angle) @ shifted)
+        return middle + radius * (turn(angle) @ shifted)
 
     return Subject("bent", "football, bent and sheared (analytic)", ball, along(move), 0.004, (1.1, -0.9, 0.5))
 
@@ -66,7 +66,7 @@ def drawn() -> Subject:
         # stretch 1 + 7·exp(-(z / 0.35)²), so that F changes by much within one Gaussian
         stretch = 1 + 7 * jnp.exp(-((u[2] / 0.35) ** 2))
         z = u[2] + 7 * 0.35 * 0.5 * jnp.sqrt(jnp.pi) * jax.scipy.special.erf(u[2] / 0.35)
-        return 0.1 * (_turn(0.5 * z) @ jnp.stack([u[0] / jnp.sqrt(stretch), u[1] / jnp.sqrt(stretch), z]))
+        return 0.1 * (turn(0.5 * z) @ jnp.stack([u[0] / jnp.sqrt(stretch), u[1] / jnp.sqrt(stretch), z]))
 
     return Subject("drawn", "ball of stripes, drawn to a thread and wound (analytic)", ball, along(move), 0.003,
                    (1.2, 0.0, 0.12))  # fmt: skip
@@ -125,7 +125,8 @@ def along(move: Callable) -> Field:
     return lambda positions: tuple(np.asarray(v) for v in both(jnp.asarray(positions, jnp.float32)))
 
 
-def _turn(angle):
+def turn(angle):
+    """The rotation about z by an angle [rad]."""
     c, s = jnp.cos(angle), jnp.sin(angle)
     return jnp.stack([jnp.stack([c, -s, 0 * c]), jnp.stack([s, c, 0 * c]), jnp.array([0.0, 0.0, 1.0])])
 
@@ -135,7 +136,7 @@ def _middle(gaussians):
     return (low + high) / 2, float(np.max(high - low)) / 2
 
 
-def _objects(names: list[str]) -> dict[str, pj.Gaussians]:
+def cut_out(names: list[str]) -> dict[str, pj.Gaussians]:
     """Objects of the bundled tabletop, cut out by their masks, without floaters and nearly transparent Gaussians."""
     if not names:
         return {}

@@ -64,6 +64,12 @@ def is_known(*trees: Any) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
+def is_compiling() -> bool:
+    """Whether jit traces what is computed now, results of known values included."""
+    zero = np.float32(0)
+    return isinstance(lax.add(zero, zero), jax.core.Tracer)
+
+
 def in_precision(tree: Any, dtype: Any) -> Any:
     """The same tree with its real arrays in a precision, that of the Gaussians or particles."""
 

@@ -70,7 +70,7 @@ def eigh(symmetric: Matrices) -> tuple[Vectors, Matrices]:
     a, scale = _scaled(symmetric + transpose(symmetric))
     q = _identities(a)
     state = (a[0, 0], a[1, 1], a[2, 2]), (a[0, 1], a[0, 2], a[1, 2]), (q[:, 0], q[:, 1], q[:, 2])
-    values, _, vectors = lax.fori_loop(0, _sweeps(a), lambda _, state: _two_sided_sweep(*state), state)
+    values, _, vectors = lax.fori_loop(0, _sweeps(a), _two_sided_sweep, state)
     w = jnp.stack(values, -1) * (scale / 2)[..., None]
     return w, jnp.moveaxis(jnp.stack(vectors, 1), (0, 1), (-2, -1))
 
@@ -116,17 +116,38 @@ def inv3(matrix: Matrices) -> Matrices:
 
 def safe_norm(vector: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
     """Euclidean norm without over- or underflow of the squares; its derivative at zero is zero."""
-    scale = _power_of_two(jnp.abs(vector).max(axis))
-    squared = jnp.square(vector / jnp.expand_dims(scale, axis)).sum(axis)
-    positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0) * scale
+    scale, _, norm = _scaled_norm(vector, axis)
+    return norm * scale
 
 
 def safe_normalize(vector: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
     """Unit vector of the same direction; zero, with a zero derivative, where the vector is zero."""
-    norm = jnp.expand_dims(safe_norm(vector, axis), axis)
+    # of the scaled vector, since the derivative of a quotient has the square of the divisor
+    _, scaled, norm = _scaled_norm(vector, axis)
+    norm = jnp.expand_dims(norm, axis)
     positive = norm > 0
-    return jnp.where(positive, vector / jnp.where(positive, norm, 1.0), 0.0)
+    return jnp.where(positive, scaled / jnp.where(positive, norm, 1.0), 0.0)
+
+
+def safe_ratio(part: Float[Array, "..."], whole: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Quotient part / whole where `whole` > 0, else `part`, with derivatives down to the smallest numbers.
+
+    The derivative of a plain quotient has whole², which underflows below 1e-19 in float32.
+    """
+    usable = whole > 0
+    scale = _power_of_two(jnp.where(usable, whole, 1.0))
+    return (part / scale) / jnp.where(usable, whole / scale, 1.0)
+
+
+def _scaled_norm(
+    vector: Float[Array, "..."], axis: int
+) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+    """Power of two taken out of a vector, the vector over it, whose squares are in range, and the norm of that."""
+    scale = _power_of_two(jnp.abs(vector).max(axis))
+    scaled = vector / jnp.expand_dims(scale, axis)
+    squared = jnp.square(scaled).sum(axis)
+    positive = squared > 0
+    return scale, scaled, jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
 
 
 def quat_to_matrix(quats: Quaternions) -> Matrices:
@@ -175,7 +196,7 @@ def _decompose(matrix):
     """(u, s, v, rotation, stretch). One rule for all five lets svd and polar share the work in their derivatives."""
     m, scale = _scaled(matrix)
     columns = jnp.concatenate([m, _identities(m)])
-    columns = lax.fori_loop(0, _sweeps(m), lambda _, c: _one_sided_sweep(*c), tuple(columns[:, j] for j in range(3)))
+    columns = lax.fori_loop(0, _sweeps(m), _one_sided_sweep, tuple(columns[:, j] for j in range(3)))
     a, b, c = columns
     first, u0 = _length_and_direction(a[:3], 0.0, jnp.zeros_like(a[:3]).at[0].set(1.0))
     parallel = jnp.finfo(m.dtype).eps * _dot(b[:3], b[:3])
@@ -240,8 +261,12 @@ def _skew(vector):
     return jnp.stack([jnp.stack(row, -1) for row in [[zero, -z, y], [z, zero, -x], [-y, x, zero]]], -2)
 
 
-def _one_sided_sweep(a, b, c):
+# Bodies of loops are functions of the module: a new one in each call would be compiled again outside of jit.
+
+
+def _one_sided_sweep(_, columns):
     """Make each pair of columns orthogonal in turn, the longer one first; their lower halves collect the rotation."""
+    a, b, c = columns
     a, b = _orthogonalize(a, b)
     a, c = _orthogonalize(a, c)
     b, c = _orthogonalize(b, c)
@@ -254,8 +279,9 @@ def _orthogonalize(a, b):
     return _turn(a, b, tan, bb > aa)
 
 
-def _two_sided_sweep(diagonal, off, vectors):
+def _two_sided_sweep(_, state):
     """Zero the entries beside the diagonal in turn, the lower eigenvalue first."""
+    diagonal, off, vectors = state
     (w0, w1, w2), (o01, o02, o12), (q0, q1, q2) = diagonal, off, vectors
     w0, w1, o01, o02, o12, q0, q1 = _diagonalize(w0, w1, o01, o02, o12, q0, q1)
     w0, w2, o02, o01, o12, q0, q2 = _diagonalize(w0, w2, o02, o01, o12, q0, q2)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import cKDTree
 
-from pigjax.clamp import ClampParams, clamped_shapes
+from pigjax.clamp import ClampParams, clamped_shapes, held_deformation
 from pigjax.core.arguments import checked
 from pigjax.core.arrays import array_field, einsum, in_precision, real_field
 from pigjax.core.checks import check_axes
@@ -19,7 +19,22 @@ from pigjax.core.errors import InputError
 from pigjax.coupling.seeding import object_ids
 from pigjax.mpm import Particles, Trajectory
 from pigjax.splat import Gaussians, Splats
-from pigjax.splatting.types import as_splats
+from pigjax.splatting.types import as_splats, gaussian_factors
+
+_LONGEST = 0.5  # standard deviation of a splat of its own in motion [cells]: it is two cells long within two of them
+
+
+class OwnBinding(eqx.Module):
+    """Splats made for their matter (`make_own_splats`), and the one particle that carries each."""
+
+    gaussian: Int[Array, "m"] = array_field()  # index of the Gaussian
+    rows: Int[Array, "c"] = array_field()  # particles that carry any
+    at: Int[Array, "m"] = array_field()  # place of its carrier in `rows`
+    offsets: Float[Array, "m 3"] = real_field()  # from the particle to the Gaussian, at rest [m]
+    longest: Float[Array, ""] = real_field()  # largest standard deviation in motion [m]
+
+    def __len__(self) -> int:
+        return self.gaussian.shape[0]
 
 
 class Binding(eqx.Module):
@@ -29,13 +44,22 @@ class Binding(eqx.Module):
     particles: Int[Array, "m k"] = array_field()  # indices of its carriers
     weights: Float[Array, "m k"] = real_field()  # of the carriers; sum to 1
     offsets: Float[Array, "m k 3"] = real_field()  # from each particle to the Gaussian, at rest [m]
+    own: OwnBinding | None = None  # splats as fine as their particles; None traces nothing
 
     def __len__(self) -> int:
-        return self.gaussian.shape[0]
+        return self.gaussian.shape[0] + (0 if self.own is None else len(self.own))
 
 
 @checked
-def bind(gaussians: Gaussians, labels: Any, particles: Particles, *, neighbours: int = 4) -> Binding:
+def bind(
+    gaussians: Gaussians,
+    labels: Any,
+    particles: Particles,
+    *,
+    neighbours: int = 4,
+    carrier: Int[Array, "n"] | Int[np.ndarray, "n"] | None = None,
+    dx: float | None = None,
+) -> Binding:
     """Carriers for the Gaussians of moving objects that have no particle of their own. Host.
 
     These are floaters, and the Gaussians that `gaussians_per_cell` left out; the length of the result is their number.
@@ -46,9 +70,12 @@ def bind(gaussians: Gaussians, labels: Any, particles: Particles, *, neighbours:
         labels: `Labels`, or the object id of each Gaussian [n].
         particles: of `seed_particles`, at rest.
         neighbours: number of carriers of each Gaussian; four span an affine motion.
+        carrier: particle of each Gaussian that was made for its matter, as `OwnSplats.carrier`; -1 for all others. They
+            follow that particle alone. None: there are none.
+        dx: grid spacing, needed with `carrier`: in motion no such splat gets longer than two cells [m].
 
     Raises:
-        InputError: the labels are not one for each Gaussian.
+        InputError: the labels or carriers are not one for each Gaussian, or dx is missing.
     """
     object_id = object_ids(gaussians, labels)
     means, x, carried = np.asarray(gaussians.means), np.asarray(particles.x), np.asarray(particles.gaussian)
@@ -66,7 +93,31 @@ def bind(gaussians: Gaussians, labels: Any, particles: Particles, *, neighbours:
     # a Gaussian at the position of a particle is carried by that one alone, at any scale of the scene
     weights = 1 / np.maximum(squared, 1e-12 * squared.max(initial=1e-200))
     weights = (weights / weights.sum(1, keepdims=True)).astype(x.dtype)
-    return Binding(jnp.asarray(loose), jnp.asarray(nearest), jnp.asarray(weights), jnp.asarray(offsets))
+    own = None if carrier is None else _bound_to_one(means, x, np.asarray(carrier), dx)
+    return Binding(jnp.asarray(loose), jnp.asarray(nearest), jnp.asarray(weights), jnp.asarray(offsets), own)
+
+
+def _bound_to_one(means: np.ndarray, x: np.ndarray, carrier: np.ndarray, dx: float | None) -> OwnBinding | None:
+    """Gaussians with one carrier each.
+
+    Raises:
+        InputError: not one carrier for each Gaussian, one that is no particle, or no dx.
+    """
+    if carrier.shape != (len(means),) or carrier.max(initial=-1) >= len(x):
+        raise InputError(f"bind: carrier of shape {carrier.shape}: give a particle below {len(x)}, or -1, to each.")
+    if dx is None:
+        raise InputError("bind: dx is missing: carrier needs it, for the bound on the length of its splats.")
+    gaussian = np.flatnonzero(carrier >= 0)
+    if not len(gaussian):
+        return None
+    rows, at = np.unique(carrier[gaussian], return_inverse=True)
+    return OwnBinding(
+        gaussian=jnp.asarray(gaussian),
+        rows=jnp.asarray(rows),
+        at=jnp.asarray(at),
+        offsets=jnp.asarray(means[gaussian] - x[carrier[gaussian]]),
+        longest=jnp.asarray(_LONGEST * dx, means.dtype),
+    )
 
 
 @checked
@@ -81,8 +132,9 @@ def deform(
     """The scene posed by its particles: Gaussians moved and shaped by the deformation of the matter (paper 3.3).
 
     A Gaussian with a particle takes its position and `F_visual`. A bound one is at Σ wᵢ (xᵢ + Fᵢ rᵢ), which is exact
-    for affine motion. Only means, factors and rotations of the colour of these two kinds are written; all else is the
-    rest pose.
+    for affine motion. A splat that was made for its matter is at x + F r of its one particle, with the stretch of F
+    held within the clamp's bounds in every mode, and is never longer than two cells. Only means, factors and rotations
+    of the colour of these kinds are written; all else is the rest pose.
 
     Args:
         gaussians: the scene at rest.
@@ -113,12 +165,31 @@ def deform(
     factors, turned = clamped_shapes(quats, log_scales, F, params, mode=mode, coloured=coloured)
     rest = as_splats(gaussians)
     at_rest = jnp.broadcast_to(jnp.eye(3, dtype=F.dtype), (len(gaussians), 3, 3))
+    if binding is not None and binding.own is not None:
+        rows, means, shapes, turns = _own_pose(gaussians, particles, binding.own, params, turned)
+        index, x, factors = (jnp.concatenate(parts) for parts in ((index, rows), (x, means), (factors, shapes)))
+        turned = None if turned is None or turns is None else jnp.concatenate([turned, turns])
     return dataclasses.replace(
         rest,
         means=rest.means.at[index].set(x, mode="drop"),
         factors=rest.factors.at[index].set(factors, mode="drop"),
         sh_rotations=None if turned is None else at_rest.at[index].set(turned, mode="drop"),
     )
+
+
+def _own_pose(
+    gaussians: Gaussians, particles: Particles, own: OwnBinding, params: ClampParams, turned: Array | None
+) -> tuple[Array, Array, Array, Array | None]:
+    """Index, mean, factor and rotation of the colour of splats that were made for their matter."""
+    held, rotation, largest = held_deformation(particles.F_visual[own.rows], params)
+    mine = Gaussians(*(getattr(gaussians, f.name)[own.gaussian] for f in dataclasses.fields(Gaussians)))
+    # decomposed once for each particle, not for each splat: what exceeds the length is shrunk as a whole
+    widest = jnp.exp(mine.log_scales).max(1) * largest[own.at]
+    shrunk = jnp.minimum(1, own.longest / widest)
+    here = held[own.at]
+    means = particles.x[own.rows][own.at] + einsum("mij,mj->mi", here, own.offsets)
+    factors = einsum("mij,mjk->mik", here, gaussian_factors(mine)) * shrunk[:, None, None]
+    return own.gaussian, means, factors, None if turned is None else rotation[own.at]
 
 
 @checked

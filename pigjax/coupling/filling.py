@@ -120,7 +120,7 @@ def lattice_cells(
         raise InputError(f"{name}: a lattice of {counts.tolist()} cells at {step:.3g} m is too fine; coarsen spacing.")
     refinement = int(np.clip(np.ceil(step / solid.voxel), 2, 4))
     offsets = np.array(list(product((np.arange(refinement) + 0.5) / refinement, repeat=3)))
-    reach = 3 + 2 * int(np.ceil(step / solid.voxel))
+    reach = 3 + 2 * int(min(np.ceil(step / solid.voxel), max(solid.occupancy.shape)))
     touched = ndimage.maximum_filter(solid.occupancy, reach) > 0
     slabs = []
     # one slab at a time bounds the memory for a lattice that is mostly empty

@@ -85,7 +85,8 @@ def fill_hidden(
         object_id: the object to fill.
         hidden_by: ids of the objects that hid it; None: of all other objects.
         up: axis of the world that points up: without `eyes` the surface was seen from above.
-        eyes: positions of the cameras [m]; None: not known.
+        eyes: positions of the cameras [m]; None: not known, and all that the object's own Gaussians cover counts as
+            seen, but next to the others.
         shadows: whether shadows are lightened.
         name: of the object, for messages.
 
@@ -114,7 +115,7 @@ def fill_hidden(
     sh = np.asarray(gaussians.sh, np.float64)
     colour, cover = _seen_from_outside(shell, sh[own], near.on & ~patch.doubtful[near.node], patch)
     known = (cover >= _COVERED) & ~patch.doubtful
-    wanted = known | (~known & _enclosed(patch, known, shell.means[shell.connected & ~near.on]))
+    wanted = known | ((patch.under | patch.doubtful) & _enclosed(patch, known, shell.means[shell.connected & ~near.on]))
     if not known.any() or known[wanted].all():
         return Filled(gaussians, labels, 0, 0)
     patch, colour, known = patch.only(wanted), colour[wanted], known[wanted]
@@ -145,13 +146,14 @@ class _Patch(NamedTuple):
     nodes: Float[np.ndarray, "q 3"]  # [m]
     normals: Float[np.ndarray, "q 3"]  # unit, outward
     doubtful: Bool[np.ndarray, "q"]  # nobody saw them, or what they show is mixed with another object
+    under: Bool[np.ndarray, "q"]  # within the outline of the others, or next to it
     distance: Float[np.ndarray, "q"]  # from the outline of the others, in widths of the rim
     spacing: float  # [m]
 
     def only(self, chosen: Bool[np.ndarray, "q"]) -> _Patch:
         """Some of the nodes."""
-        nodes, normals, doubtful, distance = (column[chosen] for column in self[:4])
-        return _Patch(nodes, normals, doubtful, distance, self.spacing)
+        nodes, normals, doubtful, under, distance = (column[chosen] for column in self[:5])
+        return _Patch(nodes, normals, doubtful, under, distance, self.spacing)
 
 
 class _Near(NamedTuple):
@@ -219,12 +221,16 @@ def _patch(
         return None
     outline, rim = np.concatenate(outlines), np.concatenate(rims)
     nodes, across = _spread(outline, rim, onto, spacing)
-    seen = share_seen(nodes, blockers, spacing, up, eyes)
-    hidden, doubtful = seen == 0, seen < _LEAST_SEEN
-    if hidden.any():
-        doubtful |= cKDTree(nodes[hidden]).query(nodes)[0] <= _MARGIN * spacing
+    if eyes is None:  # whatever the surface's own Gaussians cover may have been seen from somewhere
+        doubtful = cKDTree(blockers).query(nodes)[0] <= _MARGIN * spacing
+    else:
+        seen = share_seen(nodes, blockers, spacing, eyes)
+        hidden, doubtful = seen == 0, seen < _LEAST_SEEN
+        if hidden.any():
+            doubtful |= cKDTree(nodes[hidden]).query(nodes)[0] <= _MARGIN * spacing
     gap, nearest = cKDTree(outline).query(nodes)
-    return _Patch(nodes, across, doubtful, gap / rim[nearest], spacing)
+    under = gap <= (1 + _MARGIN) * spacing  # of the outline's points, which lie a spacing apart
+    return _Patch(nodes, across, doubtful, under, gap / rim[nearest], spacing)
 
 
 def _spread(outline: Float[np.ndarray, "p 3"], rim: Float[np.ndarray, "p"], onto, spacing: float):

@@ -38,6 +38,7 @@ def seed_particles(
     particles_per_cell: float | int = 8,
     gaussians_per_cell: int | None = None,
     colliders: Sequence[Collider] = (),
+    poured: Mapping[int, float] | None = None,
     seed: int = 0,
     max_cells: int = 64,
     max_particles: int = 4_000_000,
@@ -63,6 +64,8 @@ def seed_particles(
         gaussians_per_cell: most Gaussians that become particles in one lattice cell; `bind` finds carriers for the
             others. None: no limit.
         colliders: the space inside of them is not filled.
+        poured: by object id, volume of each particle of objects that are filled by their Gaussians already [m³]: these
+            are their particles, one each. None: there are none.
         seed: of the jitter.
         max_cells: finest resolution of the inside test, see `fill_interior`.
         max_particles: most lattice cells of one object; bounds memory.
@@ -79,19 +82,24 @@ def seed_particles(
     velocities, spins = dict(velocities or {}), dict(spins or {})
     _check_ids(object_id, materials, {**spins, **velocities})
     host = jax.tree.map(np.asarray, gaussians)
-    objects = []
+    objects, poured, parts = [], dict(poured or {}), {}
     for name in materials:
         members = np.flatnonzero(object_id == name)
+        if name in poured:
+            parts[name] = _Matter(host.means[members], np.full(len(members), poured[name]), members)
+            continue
         shell = shell_of(jax.tree.map(lambda values, members=members: values[members], host), name=f"object {name}")
         objects.append(_Object(name, members, shell, solid_of(shell, max_cells=max_cells)))
-    step = _step(objects, spacing, particles_per_cell)
-
-    parts = []
-    for row, item in enumerate(objects):
-        matter = _matter_of(item, objects, colliders, step, fill, gaussians_per_cell, seed, max_particles)
-        velocity = np.broadcast_to(np.asarray(velocities.get(item.name, 0.0), float), matter.positions.shape)
-        parts.append((*matter, np.full(len(matter.volumes), row), velocity))
-    positions, volumes, carried, rows, velocity = (np.concatenate(column) for column in zip(*parts))
+    if objects:
+        step = _step(objects, spacing, particles_per_cell)
+        for item in objects:
+            parts[item.name] = _matter_of(item, objects, colliders, step, fill, gaussians_per_cell, seed, max_particles)
+    columns = []
+    for row, name in enumerate(materials):
+        matter = parts[name]
+        velocity = np.broadcast_to(np.asarray(velocities.get(name, 0.0), float), matter.positions.shape)
+        columns.append((*matter, np.full(len(matter.volumes), row), velocity))
+    positions, volumes, carried, rows, velocity = (np.concatenate(column) for column in zip(*columns))
     table = material_table(list(materials.values()))
     particles = make_particles(
         jnp.asarray(positions, gaussians.means.dtype),
@@ -102,7 +110,7 @@ def seed_particles(
         gaussian=carried,
         body=rows,
     )
-    turns = {row: np.asarray(spins[item.name], float) for row, item in enumerate(objects) if item.name in spins}
+    turns = {row: np.asarray(spins[name], float) for row, name in enumerate(materials) if name in spins}
     return _spun(particles, turns), table
 
 

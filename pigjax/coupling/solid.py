@@ -24,7 +24,6 @@ _LEAST_SKY = 2.0  # a sample that sees less of the outside, or sees it on both s
 _LEAST_DISCS = 8
 _EYES = 16  # cameras that are asked for the outer side of a surface
 _LEAST_TOWARDS = 0.05  # of their mean unit direction along a normal; less is seen from both sides, or hidden
-_LEAST_RISE = 0.3  # sine of the elevation of the directions from which things on a surface hide it; cameras look down
 _LEAST_JUMP = 0.3  # least jump of the winding number across the surface of a shell
 _FULL = 0.25  # share of inner voxels with Gaussians in them above which a cloud is filled, not a shell
 _MOST_SWELLING = 2.0  # volume of a filled cloud's density over that of its winding number; strays in a shell exceed it
@@ -218,6 +217,19 @@ def surface_of(
     return discs.points[sided], discs.normals[sided]
 
 
+def surface_samples(shell: Shell, spacing: float) -> Float[np.ndarray, "s 3"]:
+    """Points on a surface of whatever side, one for each voxel that it passes [m].
+
+    Args:
+        shell: of `shell_of`.
+        spacing: edge of a voxel [m].
+    """
+    kept = _surface_members(shell)
+    samples = disc_samples(shell, kept, spacing)
+    _, owner, counts = np.unique(np.floor(samples / spacing), axis=0, return_inverse=True, return_counts=True)
+    return np.stack([np.bincount(owner.ravel(), samples[:, i]) for i in range(3)], 1) / counts[:, None]
+
+
 def _surface_members(shell: Shell) -> Bool[np.ndarray, "n"]:
     kept = shell.connected & (shell.opacities >= min(_LEAST_OPACITY, np.median(shell.opacities)))
     return kept if kept.any() else shell.connected
@@ -295,28 +307,22 @@ def share_seen(
     points: Float[np.ndarray, "s 3"],
     blockers: Float[np.ndarray, "b 3"],
     voxel: float,
-    up: Float[np.ndarray, "3"],
-    eyes: Float[np.ndarray, "e 3"] | None = None,
+    eyes: Float[np.ndarray, "e 3"],
 ) -> Float[np.ndarray, "s"]:
-    """Share of the cameras, or of the sky where these are not known, that other objects do not hide from each point.
+    """Share of the cameras that other objects do not hide from each point.
 
     Args:
         points: of a surface [m].
         blockers: samples of the other objects [m], at most a voxel apart.
         voxel: edge of the voxels that they fill [m].
-        up: unit vector.
-        eyes: positions of the cameras [m], of which some sixteen are tried; None: not known.
+        eyes: positions of the cameras [m], of which some sixteen are tried.
     """
     low = np.minimum(points.min(0), blockers.min(0)) - _MARGIN * voxel
     high = np.maximum(points.max(0), blockers.max(0)) + _MARGIN * voxel
     occupied = np.zeros(np.ceil((high - low) / voxel).astype(int) + 1, bool)
     occupied[tuple(np.floor((blockers - low) / voxel).astype(int).T)] = True
     cells = (points - low) / voxel
-    if eyes is not None:
-        return np.mean([_open_to(eye, occupied, points, cells)[0] for eye in _some(eyes)], axis=0)
-    upward = _DIRECTIONS[_DIRECTIONS @ up > _LEAST_RISE * np.linalg.norm(_DIRECTIONS, axis=1)]
-    index = tuple(np.floor(cells).astype(int).T)
-    return np.mean([~_blocked(occupied, direction)[index] for direction in upward], axis=0)
+    return np.mean([_open_to(eye, occupied, points, cells)[0] for eye in _some(eyes)], axis=0)
 
 
 def _sky(

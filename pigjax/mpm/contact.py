@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from pigjax.core.arrays import as_array, static_field
 from pigjax.core.checks import Limits, check_fields
 from pigjax.core.errors import InputError
-from pigjax.core.linalg import safe_norm, safe_normalize
+from pigjax.core.linalg import safe_norm, safe_normalize, safe_ratio
 
 # Distance of the centres of two touching half spaces within a node's reach [cells]: 0.81 at a node on their
 # border, 0.9 half a cell off it (the idea: Nairn and Guilkey 2015, doi 10.1002/nme.4834, sec. 3).
@@ -66,7 +66,7 @@ class BodyContact(eqx.Module):
         approach = (relative * normal).sum(-1, keepdims=True)
         glide = relative - approach * normal
         speed = safe_norm(glide)[..., None]
-        kept = jnp.maximum(1 - self.friction * approach / jnp.where(speed > 0, speed, 1.0), 0.0)
+        kept = jnp.maximum(1 - safe_ratio(self.friction * approach, speed), 0.0)
         met = near & (approach > 0)
         parted = jnp.where(met, common + kept * glide, velocity)
         # with three bodies or more at a node, normals are not quite opposite

@@ -151,11 +151,12 @@ def grid_kernels(single: bool) -> tuple[Any, Any]:
                         if speed < real(0.0):
                             glide = wp.length(tangential)
                             if glide >= -friction * speed and glide > real(0.0):
-                                kept = real(1.0) + friction * speed / glide
-                                of_kept = wp.dot(of_out, tangential)
-                                of_friction[b, c, n] += of_kept * speed / glide
-                                drag = of_kept * friction / glide
-                                of_tangential = kept * of_out - (drag * speed / (glide * glide)) * tangential
+                                # no square of the glide, which may vanish
+                                ratio, way = friction * speed / glide, tangential / glide
+                                of_way = wp.dot(of_out, way)
+                                of_friction[b, c, n] += of_way * speed
+                                drag = of_way * friction
+                                of_tangential = (real(1.0) + ratio) * of_out - (of_way * ratio) * way
                                 of_speed = drag - wp.dot(of_tangential, normal)
                                 of_before += of_tangential + of_speed * normal
                                 of_normal = of_speed * before - speed * of_tangential

@@ -102,12 +102,12 @@ def frame_laws(single: bool) -> tuple[Any, Any]:
         constant, first = tr * tr - real(4.0) * minors, wp.sqrt(real(3.0) * tr)
         for _ in range(wp.static(newtons)):
             slope = real(4.0) * first * (first * first - tr) - real(8.0) * J
-            if slope > real(0.0):
+            if slope > real(0.1) * first * first * first:  # below, the closed form is not used
                 value = (first * first - real(2.0) * tr) * first * first - real(8.0) * J * first + constant
                 first -= value / slope
         second = (first * first - tr) / real(2.0)
         sums = first * second - J
-        if not (sums >= real(wp.static(ill)) * first * first * first):
+        if sums == real(0.0) or not (sums >= real(wp.static(ill)) * first * first * first):
             return by_turns(f)
         return (first * cofactors(f) + (first * first - second) * f - b * f) / sums
 

@@ -77,8 +77,8 @@ class Nodes(NamedTuple):
     velocity: Velocities  # of bodies that are not rigid [m/s]
     weight: Masses  # with which the bodies meet
     arms: Velocities  # from the centres of mass of the bodies [cells]
-    faces: Any  # of each body, for `resolve`: arrays [b x y z ...]
-    bounds: Any  # that all bodies share, for `resolve`: arrays [x y z ...]
+    faces: Any  # of each body, for `Meeting`: arrays [b x y z ...]
+    bounds: Any  # that all bodies share, for `Meeting`: arrays [x y z ...]
 
     def at(self, index: Int[Array, "k"]) -> Nodes:
         """Some of them, as a grid of k by 1 by 1; those whose number is that of all nodes weigh nothing."""
@@ -94,7 +94,12 @@ class Nodes(NamedTuple):
         return some._replace(weight=jnp.where(real[:, None, None, None], some.weight, 0.0))
 
 
-Resolve = Callable[[Velocities, Masses, Any, Any], Velocities]
+class Meeting(NamedTuple):
+    """Contact of bodies, as functions of arrays at some nodes or all."""
+
+    part: Callable[[Velocities, Masses, Any], Velocities] | None  # from each other, by `faces`; None: there is one
+    hold: Callable[[Velocities, Any, Any], Velocities]  # by `bounds`, but where rigid bodies are `clear`, if not None
+    clear: Callable[[Any, Any], Any]  # where they are, by `faces` and `bounds`
 
 
 def rigid_velocities(
@@ -102,7 +107,7 @@ def rigid_velocities(
     mass: Masses,
     velocity: Velocities,
     touched: Bool[Array, "b x y z 1"],
-    resolve: Resolve,
+    contact: Meeting,
     faces: Any,
     bounds: Any,
     cells: Float[Array, ""],
@@ -120,10 +125,9 @@ def rigid_velocities(
         mass: of the nodes, in units of the heaviest particle.
         velocity: before contact [m/s].
         touched: nodes where a body may be in contact.
-        resolve: contact at some nodes or all: velocities before it, masses, and their `faces` and `bounds` to the
-            velocities after it.
-        faces: arrays [b x y z ...] of each body, which `resolve` takes.
-        bounds: arrays [x y z ...] that all bodies share, which `resolve` takes.
+        contact: of the bodies.
+        faces: arrays [b x y z ...] of each body, which `contact` takes.
+        bounds: arrays [x y z ...] that all bodies share, which `contact` takes.
         cells: displacement in a step at 1 m/s [cells].
         rounds: of contact.
     """
@@ -132,7 +136,7 @@ def rigid_velocities(
     more = jnp.where(rigid & (norm > _FAINT), _RELAXATION / jnp.maximum(norm, _FAINT), 1.0)
     weight = mass * jnp.where(stiff, _of_nodes(more[:, None]), 1.0)
     met = (touched & stiff).any((0, -1))
-    solve = partial(_solve, resolve, rounds, stiff, bodies, bodies.motion(mass * velocity))
+    solve = partial(_solve, contact, rounds, stiff, bodies, bodies.motion(mass * velocity))
     nodes, few = Nodes(velocity, weight, bodies.arms, faces, bounds), max(_FEWEST, met.size // _SHARE)
 
     def at_some():
@@ -144,15 +148,17 @@ def rigid_velocities(
     def at_all():
         return solve(nodes)
 
+    once = velocity if contact.part is None else contact.part(velocity, mass, faces)
+    once = contact.hold(once, bounds, None)
     after, moving, spin = at_all() if few >= met.size else lax.cond(met.sum() <= few, at_some, at_all)
-    velocity = jnp.where(met[..., None], after, resolve(velocity, mass, faces, bounds))
+    velocity = jnp.where(met[..., None], after, once)
     gradient = _turning(bodies, spin, cells)
     turned = _of_nodes(moving) + (gradient[:, None, None, None] * bodies.arms[..., None, :]).sum(-1)
     return jnp.where(stiff, turned, velocity)
 
 
 def _solve(
-    resolve: Resolve,
+    contact: Meeting,
     rounds: int,
     stiff: Bool[Array, "b 1 1 1 1"],
     bodies: Bodies,
@@ -161,14 +167,27 @@ def _solve(
 ) -> tuple[Velocities, Float[Array, "b 3"], Float[Array, "b 3"]]:
     """Velocities of the nodes, and velocities and spins of the rigid bodies after all rounds."""
     bodies = bodies._replace(arms=nodes.arms)
+    clear = contact.clear(nodes.faces, nodes.bounds)
 
     @jax.checkpoint
     def visit(_, carry):
         velocity, moving, spin = carry
+        if contact.part is not None:
+            before = jnp.where(stiff, bodies.field(moving, spin), velocity)
+            velocity = contact.part(before, nodes.weight, nodes.faces)
+            faster, turned = bodies.motion(jnp.where(stiff, nodes.weight * (velocity - before), 0.0))
+            moving, spin = moving + faster, spin + turned
         before = jnp.where(stiff, bodies.field(moving, spin), velocity)
-        after = resolve(before, nodes.weight, nodes.faces, nodes.bounds)
-        faster, turned = bodies.motion(jnp.where(stiff, nodes.weight * (after - before), 0.0))
-        return after, moving + faster, spin + turned
+        velocity = contact.hold(before, nodes.bounds, clear)
+        change = jnp.where(stiff, velocity - before, 0.0)
+        faster, turned = bodies.motion(nodes.weight * change)
+        # No other body takes part, so that this one may take as much as brings its nodes nearest to their change.
+        answer = bodies.field(faster, turned)
+        acts = nodes.weight * (change != 0).any(-1, keepdims=True)
+        suits, whole = ((acts * other * answer).sum((1, 2, 3, 4)) for other in (change, answer))
+        some = whole > jnp.finfo(whole.dtype).tiny ** 0.5
+        more = jnp.where(some, suits / jnp.where(some, whole, 1.0), 1.0)[:, None]
+        return velocity, moving + more * faster, spin + more * turned
 
     return lax.fori_loop(0, rounds, visit, (nodes.velocity, *motion))
 

@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.mpm import WALL, Grid, State, StepHealth
-from pigjax.mpm.boundaries import Bounds, hold, places_of
+from pigjax.mpm.boundaries import Bounds, clear_of, hold, places_of
 from pigjax.mpm.by_law import by_component, by_row
 from pigjax.mpm.chunked import ChunkLoop, gather_chunks, scatter_chunks
 from pigjax.mpm.colliders import Collider, Contact, Press, Time
@@ -29,7 +29,7 @@ from pigjax.mpm.forces import Force, Matter
 from pigjax.mpm.health import LaneHealth
 from pigjax.mpm.materials import Parameters, respond
 from pigjax.mpm.materials.tensors import determinant, product
-from pigjax.mpm.rigid import rigid_velocities
+from pigjax.mpm.rigid import Meeting, rigid_velocities
 from pigjax.mpm.transfers import (
     CHANNELS,
     Kernel,
@@ -469,25 +469,27 @@ def _separate_bodies(
     """Velocities after contact between bodies."""
     assert context.body_contact is not None
     mass = nodes.reshape(context.bodies, *context.grid.shape, 4)[..., :1] / context.unit_mass
-    return context.body_contact.part(velocity, mass, _faces(statics, context, states, nodes))
+    return context.body_contact.part(velocity, mass, _faces(context, nodes, _moments(statics, context, states)))
 
 
-def _faces(
-    statics: StepStatics, context: StepContext, states: tuple[State, ...], nodes: Float[Array, "n y z 4"]
-) -> Faces:
-    """Where bodies touch. P2G brings the place of their matter to the grid as it does momentum."""
-    assert context.specific_volume is not None
+def _moments(statics: StepStatics, context: StepContext, states: tuple[State, ...]) -> Float[Array, "b x y z 3"]:
+    """Σ w m x of each body's matter in reach of a node, with x in cells: P2G brings it to the grid as momentum."""
     width = context.grid.shape[0]
 
-    def moments(state):
+    def placed(state):
         along = jnp.array([1, 0, 0], state.cells.dtype)[:, None]
         place = state.cells - jnp.floor(state.cells[:, :1] / width) * width * along
         return state._replace(v=place, C=0 * state.C, stress=0 * state.stress)
 
-    moment = particles_to_grid(statics, context, tuple(map(moments, states)))
-    apart = (context.bodies, *context.grid.shape, 4)
+    moment = particles_to_grid(statics, context, tuple(map(placed, states)))
+    return moment.reshape(context.bodies, *context.grid.shape, 4)[..., 1:]
+
+
+def _faces(context: StepContext, nodes: Float[Array, "n y z 4"], moments: Float[Array, "b x y z 3"]) -> Faces:
+    """Where bodies touch."""
+    assert context.specific_volume is not None
     specific = context.specific_volume[:, None, None, None, None]
-    return faces(specific * nodes.reshape(apart)[..., :1], specific * moment.reshape(apart)[..., 1:])
+    return faces(specific * nodes.reshape(*moments.shape[:-1], 4)[..., :1], specific * moments)
 
 
 def _rigid_step(
@@ -506,20 +508,30 @@ def _rigid_step(
     mass = jnp.where(filled, nodes.reshape(*apart, 4)[..., :1] / context.unit_mass, 0.0)
     places = places_of(context.grid.shape, context.low)
     bounds = Bounds(tuple(_contacts(context, time)), context.frozen, places).at_all(context.grid.shape)
-    meets, between = bounds.holds(context.domain)[..., None], None
-    if context.body_contact is not None:
-        between = _faces(statics, context, states, nodes)
-        meets = meets | between.near
+    meets, moments = bounds.holds(context.domain)[..., None], _moments(statics, context, states)
+    between = None if context.body_contact is None else _faces(context, nodes, moments)
+    meets = meets if between is None else meets | between.near
+    middle = moments / jnp.where(filled, nodes.reshape(*apart, 4)[..., :1], 1.0)
+    stiff = context.rigid[:, None, None, None]
 
-    def resolve(velocity, mass, between, bounds):
-        if context.body_contact is not None:
-            velocity = context.body_contact.part(velocity, mass, between)
-        return hold(velocity, context.colliders, bounds, statics.walls, context.domain)
+    def part(velocity, mass, own):
+        assert context.body_contact is not None
+        return context.body_contact.part(velocity, mass, own[0])
 
+    def hold_all(velocity, bounds, clear):
+        return hold(velocity, context.colliders, bounds, statics.walls, context.domain, clear=clear)
+
+    def clear(own, bounds):
+        at = (jnp.stack(bounds.places, -1) - context.low).astype(velocity.dtype)
+        found = partial(clear_of, grid=context.grid, nodes=at, middle=own[1], time=time)
+        return tuple(stiff & found(collider) for collider in context.colliders)
+
+    contact = Meeting(None if between is None else part, hold_all, clear)
     cells = context.dt / context.grid.dx
     return rigid_velocities(
-        context.rigid, mass, velocity, filled & meets, resolve, between, bounds, cells, statics.contact_rounds
-    ).reshape(*context.nodes, 3)
+        context.rigid, mass, velocity, filled & meets, contact, (between, middle), bounds, cells,
+        statics.contact_rounds,
+    ).reshape(*context.nodes, 3)  # fmt: skip
 
 
 def apply_boundaries(

@@ -23,6 +23,7 @@ from pigjax.mpm.materials import MaterialTable
 
 _COST_OF_IMPLICIT = 400  # explicit steps in the time of an implicit one, by benchmarks/implicit.py
 _MOST_SUBSTEPS = 2.0**31
+_PLACES = 64  # that positions tell apart in a cell, at the least: fewer, and slow matter stands still
 Vector = Float[Array, "3"] | Sequence[float | int] | np.ndarray
 
 
@@ -58,7 +59,9 @@ def stable_dt(
     if integrator == "implicit":
         return cfl * grid.dx / jnp.maximum(max_speed, jnp.finfo(grid.dx.dtype).tiny)
     advective = grid.dx / (table.wave_speed.max() + max_speed)
-    viscous = grid.dx**2 / (4 * (table.explicit_viscosity / table.density).max())  # infinite without viscosity
+    viscosity = (table.explicit_viscosity / table.density).max()
+    # without viscosity no bound, and no slope, which a plain quotient would make NaN
+    viscous = jnp.where(viscosity > 0, grid.dx**2 / (4 * jnp.where(viscosity > 0, viscosity, 1.0)), jnp.inf)
     return cfl * jnp.minimum(advective, viscous)
 
 
@@ -220,8 +223,11 @@ def substep_rule(
     through the particles' own extent, and `frame_substeps` takes more where the speed asks for them.
 
     Raises:
-        InputError: a number is out of range, or no step is stable.
+        InputError: a number is out of range, no step is stable, or matter lies so far from the origin that its
+            precision is too coarse for dx (unless `config.force`).
     """
+    if not config.force:
+        check_place(particles, grid)
     chosen = config.substeps is None
     near = _near(particles, grid) if chosen and is_open(grid) else grid
     given: dict[str, Any] = {"frames": frames, "frame_dt": frame_dt, "gravity": gravity, "colliders": colliders}
@@ -368,6 +374,22 @@ def longest_step(
     speed = _max_speed(particles, colliders, grid, dt, displacement=lambda v: v * dt)
     limit = float(stable_dt(table, grid, max_speed=speed, cfl=config.cfl, integrator=config.integrator))
     return limit * (1 + 1e-5), speed
+
+
+def check_place(particles: Particles, grid: Grid) -> None:
+    """Raise an InputError where half of the matter is so far from the origin that dx holds too few places."""
+    x = np.asarray(particles.x)
+    far = np.abs(x[np.isfinite(x).all(1)]).max(1)
+    if not len(far):
+        return
+    distance = np.median(far).astype(x.dtype)  # a stray is counted by `Health`
+    spacing, dx = float(np.spacing(distance)), float(grid.dx)
+    if spacing * _PLACES > dx:
+        raise InputError(
+            f"matter lies {float(distance):.3g} m from the origin, where {x.dtype.name} tells places {spacing:.2g} m"
+            f" apart, and dx is {dx:.3g} m: move the scene to the origin (origin= of the readers, input.origin), take"
+            " a larger dx or float64, or set SimConfig(force=True)."
+        )
 
 
 def check_dt(

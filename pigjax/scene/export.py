@@ -140,7 +140,7 @@ def export_run(
         if name not in run.ids:
             raise InputError(f"export: object {name!r}: {suggest(name, list(run.ids))}.")
     wanted = [run.ids[name] for name in objects]
-    moving = [run.ids[name] for name, entry in run.scene.objects.items() if not entry.fixed]
+    moving = np.unique(run.rows["object"]).tolist()
     job = _Job(
         run=run,
         out=io.output_folder(out),

@@ -25,6 +25,7 @@ from pigjax.coupling.binding import Binding, bind
 from pigjax.coupling.outliers import cut_outliers, told
 from pigjax.coupling.sdf_collider import collider_from_gaussians
 from pigjax.coupling.seeding import seed_particles
+from pigjax.coupling.vessel import vessel_from_gaussians
 from pigjax.mls_mpm import SimConfig
 from pigjax.mpm import Particles
 from pigjax.mpm.colliders import Collider
@@ -36,7 +37,7 @@ from pigjax.objects.lifting import lift
 from pigjax.scene.advice import default_dx, remarks_on
 from pigjax.scene.forces import forces_of
 from pigjax.scene.framing import framing_camera
-from pigjax.scene.schema import INPUT_FILES, CameraSpec, ClampSpec, Scene
+from pigjax.scene.schema import INPUT_FILES, OF_DRAWING, CameraSpec, ClampSpec, Scene
 from pigjax.scene.world import WorldSpec, axis_of, file_to_world, height_of, metres_of, placed_cameras
 from pigjax.segmentation import Labels, fill_unseen
 from pigjax.splat import Gaussians, RenderConfig
@@ -57,6 +58,8 @@ class Inputs:
     own: dict[str, Gaussians] = field(default_factory=dict)  # of the objects that have a file of their own
     world: Float[np.ndarray, "4 4"] | None = None  # transform from the files; None: none
     labels: Labels | None = None  # where the scale of the world needed them
+    poured: dict[int, float] = field(default_factory=dict)  # volume of each particle of a `[volumes]` block, by id [m³]
+    solids: tuple[float, dict[str, Collider]] | None = None  # still objects as colliders, and the spacing they are for
     arranged: bool = False  # whether objects were placed, copied, removed or filled
     filled: dict[str, dict[str, int]] = field(default_factory=dict)  # Gaussians "added" and "recoloured", by object
 
@@ -285,7 +288,8 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels, *, gaussians_per_cel
     keep = {inputs.ids[name]: entry.keep for name, entry in scene.objects.items()}
     labels, cut = cut_outliers(inputs.gaussians, labels, keep)
     dx = spec.dx or default_dx(scene, inputs.gaussians, labels, inputs.ids)
-    solids = _still_solids(scene, inputs, labels, dx)
+    known = inputs.solids is not None and inputs.solids[0] == dx
+    solids = inputs.solids[1] if inputs.solids and known else still_solids(scene, inputs, labels, dx)
     labels = _without_buried(inputs, labels, solids, dx)
     moving = {name: entry for name, entry in scene.objects.items() if not entry.fixed}
     materials: dict[int, Material] = {inputs.ids[name]: entry.to_material(name) for name, entry in moving.items()}
@@ -301,6 +305,7 @@ def make_plan(scene: Scene, inputs: Inputs, labels: Labels, *, gaussians_per_cel
         particles_per_cell=spec.particles_per_cell,
         gaussians_per_cell=gaussians_per_cell,
         colliders=colliders,
+        poured=inputs.poured,
         seed=spec.seed,
     )
     binding = bind(inputs.gaussians, labels, particles)
@@ -349,25 +354,36 @@ def _contact(scene: Scene, bodies: int) -> BodyContact | None:
     return None if friction is None else BodyContact(bodies=bodies, friction=jnp.asarray(friction))
 
 
-def _still_solids(scene: Scene, inputs: Inputs, labels: Labels, dx: float) -> dict[str, Collider]:
+def still_solids(scene: Scene, inputs: Inputs, labels: Labels, dx: float) -> dict[str, Collider]:
+    """Colliders of the objects that stand still, by name.
+
+    Args:
+        scene: its objects.
+        inputs: its files.
+        labels: objects of the Gaussians, without outliers.
+        dx: grid spacing [m].
+    """
     object_id = np.asarray(labels.object_id)
     eyes = None if inputs.views is None else np.asarray(inputs.views.training.cameras.position, np.float64)
     solids: dict[str, Collider] = {}
     for name, entry in scene.objects.items():
-        if entry.fixed:
-            members = np.flatnonzero(object_id == inputs.ids[name])
-            own = jax.tree.map(
-                lambda values, members=members: jnp.asarray(np.asarray(values)[members]), inputs.gaussians
-            )
-            solids[name] = collider_from_gaussians(
-                own,
-                spacing=dx / 2,
-                up=axis_of(scene.input.up),
-                others=np.delete(np.asarray(inputs.gaussians.means), members, axis=0),
-                eyes=None if entry.is_placed else eyes,  # elsewhere they did not see it
-                friction=entry.friction,
-                name=f"objects.{name}",
-            )
+        if not entry.fixed:
+            continue
+        members = np.flatnonzero(object_id == inputs.ids[name])
+        own = jax.tree.map(lambda values, members=members: jnp.asarray(np.asarray(values)[members]), inputs.gaussians)
+        where, up = joined("objects", name), axis_of(scene.input.up)
+        if entry.hollow:
+            solids[name] = vessel_from_gaussians(own, spacing=dx / 2, up=up, friction=entry.friction, name=where)
+            continue
+        solids[name] = collider_from_gaussians(
+            own,
+            spacing=dx / 2,
+            up=up,
+            friction=entry.friction,
+            others=np.delete(np.asarray(inputs.gaussians.means), members, axis=0),
+            eyes=None if entry.is_placed else eyes,  # elsewhere they did not see it
+            name=where,
+        )
     return solids
 
 
@@ -470,17 +486,20 @@ def _camera_of_view(spec: CameraSpec, views: io.Views | None) -> Camera:
 
 
 def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
-    """Parts that the simulated states depend on; the camera, the clamp and the video do not count.
+    """Parts that the simulated states depend on; the camera, the clamp, the light and the video do not count.
 
     Nor does the name of the accuracy count, but the values that it set do; files count by their content.
     """
     settings: dict[str, Any] = msgspec.to_builtins(scene)
-    for name in ("accuracy", "camera", "clamp", "drawing", "folder", "output"):
+    for name in ("accuracy", "camera", "clamp", "drawing", "folder", "light", "output"):
         settings.pop(name)
     if scene.output.compress_states:
         settings["output"] = {"compress_states": True}
     for name in INPUT_FILES:
         settings["input"].pop(name)
+    for entry in (settings["objects"] | settings["volumes"]).values():
+        for name in OF_DRAWING:
+            entry.pop(name, None)
     views = inputs.views
     content = {
         "Gaussians": inputs.gaussians,

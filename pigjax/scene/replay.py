@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -22,11 +22,13 @@ from pigjax.core.placing import similarity
 from pigjax.coupling.binding import Binding, bind, deform
 from pigjax.mpm import Particles
 from pigjax.mpm.colliders import Collider, SampledDistance
+from pigjax.scene.own import Liquids, liquids_of, smooth_of
 from pigjax.scene.plan import Inputs, clamp_params, make_cameras, read_gaussians, read_inputs
 from pigjax.scene.schema import Scene, load_scene
 from pigjax.scene.world import axis_of
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, Splats
+from pigjax.splatting.shadows import Light, cast_shadows, light_transmittance
 
 SCENE_FILE = "scene.toml"  # settings of the run, in its folder
 COLLIDER_FILE = "colliders.npz"  # sampled distances of still objects
@@ -63,13 +65,16 @@ def store_colliders(path: str | os.PathLike[str], scene: Scene, colliders: Seque
     io.save_arrays(path, arrays)
 
 
-def store_rest(path: str | os.PathLike[str], inputs: Inputs, dx: float) -> None:
+def store_rest(
+    path: str | os.PathLike[str], inputs: Inputs, dx: float, own: Mapping[str, np.ndarray] | None = None
+) -> None:
     """Write ids of objects, the transform from the files to the world, and Gaussians that are not as in their file.
 
     Args:
         path: of the file.
         inputs: of the run.
         dx: grid spacing of the run [m].
+        own: arrays of `own.with_own`, for splats that were made for their matter.
     """
     arrays = {
         "names": np.asarray(list(inputs.ids), str),
@@ -79,7 +84,7 @@ def store_rest(path: str | os.PathLike[str], inputs: Inputs, dx: float) -> None:
     }
     if inputs.moved:
         arrays |= {field.name: np.asarray(getattr(inputs.gaussians, field.name)) for field in fields(Gaussians)}
-    io.save_arrays(path, arrays)
+    io.save_arrays(path, arrays | dict(own or {}))
 
 
 @dataclass
@@ -97,6 +102,9 @@ class Run:
     world: Float[np.ndarray, "4 4"]  # transform from the files to the frame of the simulation
     clamp: ClampParams = field(repr=False)  # with which splats are posed; `dataclasses.replace` takes another
     mode: str = "aligned"  # of the clamp
+    # particle of each Gaussian that was made for its matter, -1 for the others; None: there are none
+    carrier: Int[np.ndarray, "n"] | None = field(default=None, repr=False)
+    smooth: dict[int, float] = field(default_factory=dict)  # sheen of fluids with a smooth surface, by id
 
     @property
     def to_capture(self) -> Float[np.ndarray, "4 4"]:
@@ -129,7 +137,7 @@ class Run:
             raise InputError(
                 f"{self.folder}: the state of frame 0 is missing, from which the others are posed; run the scene again."
             )
-        binding = bind(self.gaussians, self.object_id, self.rest)
+        binding = bind(self.gaussians, self.object_id, self.rest, carrier=self.carrier, dx=self.dx)
         return binding if len(binding) else None
 
     def particles(self, frame: int) -> Particles:
@@ -146,7 +154,32 @@ class Run:
         Raises:
             MissingFileError: the frame has no state.
         """
-        return _pose(self.gaussians, self.particles(frame), self.clamp, self.binding, self.mode)
+        splats = self._posed(frame)
+        return splats if self.scene.light is None else self._shaded(splats, self.scene.light.to_light())
+
+    def _posed(self, frame: int) -> Splats:
+        gaussians, particles = self.gaussians, self.particles(frame)
+        if self.liquids is not None:
+            gaussians, particles = self.liquids(gaussians, particles)
+        return _pose(gaussians, particles, self.clamp, self.binding, self.mode)
+
+    def _shaded(self, splats: Splats, light: Light) -> Splats:
+        casts = jnp.asarray(self.moving)
+        reached = light_transmittance(splats, casts, light)
+        return cast_shadows(splats, casts, light, reached, self._lit_at_rest)
+
+    @cached_property
+    def _lit_at_rest(self) -> Float[Array, "n"]:
+        assert self.scene.light is not None
+        splats = self._posed(self.frames[0])
+        return light_transmittance(splats, jnp.asarray(self.moving), self.scene.light.to_light())
+
+    @cached_property
+    def liquids(self) -> Liquids | None:
+        """Fluids that are drawn with a smooth surface."""
+        if self.carrier is None:
+            return None
+        return liquids_of(self.smooth, self.rows["object"], self.rest.x, self.carrier, self.dx)
 
     @cached_property
     def moving(self) -> np.ndarray:
@@ -239,6 +272,8 @@ def load_run(folder: str | os.PathLike[str], *, scene: Scene | None = None) -> R
         world=stored["world"],
         clamp=clamp_params(scene.clamp),
         mode=scene.clamp.mode,
+        carrier=stored.get("carrier"),
+        smooth=smooth_of(stored),
     )
 
 

@@ -90,7 +90,7 @@ def left_out(scene: Scene, report: RunReport) -> list[str]:
     found.append("Forces of matter on fixed objects and colliders, which stay or move as told.")
     turns = report.modelled.get("sh_coefficients", 1) > 1
     light = "shadows and highlights stay as they were captured" + (", and turn with the matter." if turns else ".")
-    found.append(f"Light: {light}")
+    found.append(f"Light: {light}" + (" No shadows fall (a table light)." if scene.light is None else ""))
     if scene.clamp.mode == "fixed":
         found.append('The stretch of splats, which keep their rest shape (clamp.mode = "fixed").')
     if not any(entry.fill for entry in scene.objects.values()):

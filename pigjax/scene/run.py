@@ -20,7 +20,7 @@ import numpy as np
 from pigjax import io
 from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
-from pigjax.core.errors import SimulationError, StaleError
+from pigjax.core.errors import InputError, SimulationError, StaleError
 from pigjax.core.linalg import safe_norm
 from pigjax.coupling.binding import deform
 from pigjax.mpm import Particles
@@ -33,6 +33,7 @@ from pigjax.scene.arrangement import arrange
 from pigjax.scene.budget import ScenePlan, refined
 from pigjax.scene.costs import Comparison, Pace, Prediction, predict
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
+from pigjax.scene.own import MADE, Liquids, chosen, is_torn, laws_of, liquids_of, smooth_of, with_own
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
 from pigjax.scene.replay import COLLIDER_FILE, REST_FILE, SCENE_FILE, rows_of, store_colliders, store_rest
 from pigjax.scene.report import RunReport
@@ -43,7 +44,8 @@ from pigjax.scene.schema import Scene, values_of
 from pigjax.scene.stages import Stage, simulate_stages, stages_of
 from pigjax.scene.world import described
 from pigjax.segmentation import Labels, pixel_ids
-from pigjax.splat import Gaussians, render
+from pigjax.splat import Gaussians, RenderConfig, Splats, render
+from pigjax.splatting.shadows import Light, cast_shadows, light_transmittance
 
 _SHEET_FRAMES = 12
 _FILES = (
@@ -135,17 +137,10 @@ def _run(
         tell("seed", 0, 1)
         voted, plan = labels, make_plan(scene, inputs, labels)
         labels = plan.labels
-        io.save_labels(
-            out / "labels.npz",
-            labels.object_id,
-            labels.votes,
-            labels.confidence,
-            labels.ids,
-            scene=_mark(scene, inputs),
-        )
-        io.save_rows(out / "states", rows_of(plan.particles, labels), signature=key)
+        rows = rows_of(plan.particles, labels)
+        made = _made_before(out / REST_FILE)
+        _store(scene, inputs, plan, rows, out, key, made)
         store_colliders(out / COLLIDER_FILE, scene, plan.colliders)
-        store_rest(out / REST_FILE, inputs, plan.dx)
         io.write_toml(out / SCENE_FILE, values_of(given, out))
         tell("seed", 1, 1)
     _describe(scene, inputs, plan, labels, report)
@@ -156,7 +151,8 @@ def _run(
     prediction = _predict(scene, inputs, plan, stages, report, planned)
     say(report.plan)
     told = say if planned is not None else None
-    pictures = _Pictures.of(scene, inputs, plan)
+    own_wanted = any(entry.splats != "carried" for entry in scene.objects.values())
+    pictures = None if own_wanted else _Pictures.of(scene, inputs, plan)  # of own splats, they are not known yet
     states = _simulate(scene, plan, stages, out / "states", parts, key, report, tell, told, prediction)
     followed = None
     if frames := min(scene.output.error_frames, scene.simulation.frames):
@@ -166,8 +162,23 @@ def _run(
         with report.stage("simulate"):
             for _ in states:
                 pass
+    seen, shown, liquids = inputs, plan, None
+    if own_wanted:
+        with report.stage("splats"):
+            tell("splats", 0, 1)
+            names = chosen(scene, laws_of(scene, plan), partial(_was_torn, scene, inputs, rows, out / "states", key))
+            seen, shown, own = with_own(scene, inputs, plan, names, stored=made, say=say)
+            if names:
+                rows["gaussian"] = np.asarray(shown.particles.gaussian)
+                _store(scene, seen, shown, rows, out, key, own)
+                liquids = liquids_of(smooth_of(own), rows["object"], plan.particles.x, own["carrier"], plan.dx)
+                report.sizes["own_splats_of"] = {
+                    name: int(np.sum(np.asarray(shown.labels.object_id) == inputs.ids[name])) for name in names
+                }
+            tell("splats", 1, 1)
     with report.stage("draw"):
-        _draw(scene, inputs, plan, labels, pictures, out, key, report, tell, states)
+        pictures = pictures or _Pictures.of(scene, seen, shown)
+        _draw(scene, seen, shown, shown.labels, pictures, out, key, report, tell, states, liquids)
     if followed is not None:
         with report.stage("estimate"):
             tell("estimate", 0, 1)
@@ -204,6 +215,43 @@ def _compare(report: RunReport, prediction: Prediction, say: Say | None) -> None
     )
     if say is not None and not report.sizes.get("resumed_from_frame"):
         say(spent.line())
+
+
+def _store(
+    scene: Scene, inputs: Inputs, plan: Plan, rows: dict[str, np.ndarray], out: Path, key: str,
+    own: dict[str, np.ndarray],
+) -> None:  # fmt: skip
+    """Write what poses the splats of every frame: labels, rows of the particles, and the rest state."""
+    labels = plan.labels
+    io.save_labels(
+        out / "labels.npz", labels.object_id, labels.votes, labels.confidence, labels.ids, scene=_mark(scene, inputs)
+    )
+    io.save_rows(out / "states", rows, signature=key)
+    store_rest(out / REST_FILE, inputs, plan.dx, own)
+
+
+def _made_before(path: Path) -> dict[str, np.ndarray]:
+    """Splats that an earlier run made for its matter; they are used again where they fit."""
+    if not path.is_file():
+        return {}
+    try:
+        return io.load_arrays(path, "file of a run's rest state", remedy="run the scene again", prefixes=(MADE,))
+    except InputError:  # cut short by a kill: they are made again
+        return {}
+
+
+def _was_torn(scene: Scene, inputs: Inputs, rows: dict[str, np.ndarray], folder: Path, key: str, name: str) -> bool:
+    """Whether an object was torn in a frame; some of them are looked at, the last among them."""
+    if scene.output.states_every != 1:
+        warnings.warn(
+            f'objects.{name}.splats = "auto": its stretch is measured where all states are kept; drawn by the splats of'
+            ' the capture. Set output.states_every = 1, or splats = "own".',
+            stacklevel=2,
+        )
+        return False
+    own = rows["object"] == inputs.ids[name]
+    frames = np.unique(np.linspace(0, scene.simulation.frames, _SHEET_FRAMES).round().astype(int)).tolist()
+    return any(is_torn(io.load_state(folder, frame, signature=key)["F_visual"][own]) for frame in reversed(frames))
 
 
 def _mark(scene: Scene, inputs: Inputs) -> str | None:
@@ -355,11 +403,43 @@ def _checkpoint(path: Path, frame: int, particles: Particles, active: ActiveGrid
     io.save_pytree(path, (np.asarray(frame), particles, active.memory()), parts=parts)
 
 
+def shaded_picture(
+    gaussians: Gaussians,
+    splats: Splats,
+    camera: Camera,
+    shade: tuple[jax.Array, Light, jax.Array, jax.Array] | None,
+    config: RenderConfig,
+    background: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Picture of a frame in [0, 1], and the greatest stretch of each splat relative to rest.
+
+    Args:
+        gaussians: at rest.
+        splats: posed.
+        camera: of the frame.
+        shade: arguments of `cast_shadows` after the splats; None: no light, and nothing of it is traced.
+        config: of the renderer.
+        background: colour behind the splats.
+    """
+    if shade is not None:
+        splats = cast_shadows(splats, *shade)
+    frame = render(splats, camera, config, background=background, outputs=("rgb",))
+    longest = safe_norm(splats.factors, axis=1) / jnp.exp(gaussians.log_scales)  # of each axis
+    return jnp.clip(frame.rgb, 0, 1), longest.max(1)
+
+
+def _moving(scene: Scene, inputs: Inputs, labels: Labels) -> np.ndarray:
+    """Which Gaussians belong to objects that move [n]."""
+    return np.isin(np.asarray(labels.object_id), [inputs.ids[n] for n, e in scene.objects.items() if not e.fixed])
+
+
 class _Pictures(NamedTuple):
     """The cameras of all frames, and the program that poses and renders one, compiled beside the simulation."""
 
     cameras: Camera
-    program: Future[Any]  # (gaussians, particles, binding, camera): picture, and largest stretch of each splat
+    program: Future[Any]  # (gaussians, particles, binding, camera, shade): picture, largest stretch of each splat
+    lit: Callable[..., jax.Array] | None  # (gaussians, particles, binding, casts, light): transmittance
+    shade: tuple[jax.Array, Light, jax.Array, jax.Array] | None  # of `shaded_picture`, at rest
 
     @classmethod
     def of(cls, scene: Scene, inputs: Inputs, plan: Plan) -> _Pictures:
@@ -367,20 +447,27 @@ class _Pictures(NamedTuple):
         matter = np.asarray(plan.particles.x)
         cameras = make_cameras(scene, inputs, matter.mean(0), matter)
         background, config = jnp.asarray(scene.camera.background), render_config(scene)
+        lit, shade = None, None
+        if scene.light is not None:
+            ones = jnp.ones(len(inputs.gaussians), inputs.gaussians.means.dtype)
+            shade = jnp.asarray(_moving(scene, inputs, plan.labels)), scene.light.to_light(), ones, ones
+
+            @jax.jit
+            def lit(gaussians: Gaussians, particles: Particles, binding: Any, *lights: Any) -> jax.Array:
+                splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
+                return light_transmittance(splats, *lights)
 
         # everything large comes in as an argument: XLA would fold constants for minutes
         @jax.jit
-        def pose_and_render(gaussians: Gaussians, particles: Particles, binding: Any, camera: Camera):
+        def pose_and_render(gaussians: Gaussians, particles: Particles, binding: Any, camera: Camera, shade: Any):
             splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
-            frame = render(splats, camera, config, background=background, outputs=("rgb",))
-            longest = safe_norm(splats.factors, axis=1) / jnp.exp(gaussians.log_scales)  # of each axis, over rest
-            return jnp.clip(frame.rgb, 0, 1), longest.max(1)
+            return shaded_picture(gaussians, splats, camera, shade, config, background)
 
-        traced = pose_and_render.lower(inputs.gaussians, plan.particles, plan.binding, cameras[0])
+        traced = pose_and_render.lower(inputs.gaussians, plan.particles, plan.binding, cameras[0], shade)
         compiler = ThreadPoolExecutor(1)
         program = compiler.submit(traced.compile)
         compiler.shutdown(wait=False)
-        return cls(cameras, program)
+        return cls(cameras, program, lit, shade)
 
 
 def _draw(
@@ -394,16 +481,25 @@ def _draw(
     report: RunReport,
     tell: Progress,
     states: Iterator[int],
+    liquids: Liquids | None,
 ) -> None:
     """Pose and render each saved state, once `states` says that it is there; remove it where it is not to be kept."""
     frames, gaussians = scene.simulation.frames, inputs.gaussians
-    cameras = drawn.cameras
+    cameras, at_rest = drawn.cameras, None
+    moving = _moving(scene, inputs, labels)
 
     def draw(frame: int) -> tuple[jax.Array, jax.Array]:
+        nonlocal at_rest
         state = io.load_state(out / "states", frame, signature=key)
         there = tuple(np.asarray(state[name], plan.particles.x.dtype) for name in ("x", "F_visual"))
         particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, there)
-        return program()(gaussians, particles, plan.binding, cameras[frame])
+        shown, particles = (gaussians, particles) if liquids is None else liquids(gaussians, particles)
+        shade = drawn.shade
+        if shade is not None and drawn.lit is not None:
+            reached = drawn.lit(shown, particles, plan.binding, *shade[:2])
+            at_rest = reached if at_rest is None else at_rest  # the first frame that is drawn is the rest state
+            shade = *shade[:2], reached, at_rest
+        return program()(shown, particles, plan.binding, cameras[frame], shade)
 
     def program() -> Any:
         """The compiled program; time spent waiting for it counts as compiling."""
@@ -414,7 +510,6 @@ def _draw(
 
     sheet_frames = np.unique(np.linspace(0, frames, _SHEET_FRAMES).round().astype(int))
     sheet: list[np.ndarray] = []
-    moving = np.isin(np.asarray(labels.object_id), [inputs.ids[n] for n, e in scene.objects.items() if not e.fixed])
     stretches: dict[str, list[float]] = {"median": [], "99 of 100 below": [], "most": []}
 
     every, within = scene.output.states_every, report.times["draw"]

@@ -9,24 +9,28 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import field, to_builtins
-from msgspec.structs import asdict, replace
+from msgspec.structs import replace
 
 from pigjax import io
 from pigjax.core.arguments import checked
 from pigjax.core.checks import LARGEST_WHOLE, Limits, joined, shown, suggest
 from pigjax.core.errors import InputError, MissingFileError, SceneError
 from pigjax.core.regions import Region
-from pigjax.mpm.colliders import Box, Capsule, Collider, Cylinder, Plane, Sphere
+from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import broken_by
 from pigjax.mpm.materials import LAWS, PRESETS, TEARING, Material, Parameters
 from pigjax.scene.accuracy import LEVELS, Accuracy, with_level
+from pigjax.scene.colliders import BoxSpec, CapsuleSpec, CylinderSpec, PlaneSpec, SphereSpec
 from pigjax.scene.decode import Section, decode, merged
 from pigjax.scene.forces import AnyForce
+from pigjax.scene.light import LightSpec
 from pigjax.scene.regions import RegionSpec, regions_of
 from pigjax.scene.world import WorldSpec, axis_of, metres_of
 from pigjax.splatting.types import RenderConfig
 
 Triple = tuple[float, float, float]
+_OF_OWN_SPLATS = {"inside": None, "surface": "particles", "transparency": 0.0, "sheen": 0.0}
+OF_DRAWING = ("splats", *_OF_OWN_SPLATS, "colour", "grain")  # fields of an object on which no simulated state depends
 _NUMBERS = tuple(number.name for number in fields(Parameters))
 _PLACE = Limits(-1e9, 1e9, unit="m")
 _LENGTH = Limits(0, 1e9, above=True, unit="m")
@@ -206,10 +210,20 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     rigid: bool = False  # neither bends nor breaks, and is pushed by what it meets; its material gives the density
     friction: Annotated[float, _FRICTION] = 0.5  # Coulomb's coefficient of a fixed object; that of many dry pairs
     fill: bool = False  # close the surface of a fixed object where those that move or are removed hid it
+    # a fixed cup, bowl or box: a wall a cell thick along its outside, and an inside that matter may fill
+    hollow: bool = False
     material: str | None = None  # name of a preset; its numbers may be replaced by the fields below
     model: str | None = None  # name of a law, instead of a preset; its numbers follow
     velocity: Annotated[Triple, _SPEED] = (0.0, 0.0, 0.0)  # at its start
     angular_velocity: Annotated[Triple, Limits(-1e6, 1e6, unit="rad/s")] = (0.0, 0.0, 0.0)  # about its centre of mass
+    # its splats in motion: those of the capture ("carried"), or ones as fine as its particles, made once ("own");
+    # "auto": own ones for sand, snow, fluids, foam and plasticine, and for other matter that the simulation tore
+    splats: Literal["carried", "own", "auto"] = "carried"
+    inside: Annotated[Triple, Limits(0, 1)] | None = None  # colour within, of own splats; None: of the nearest surface
+    # of a fluid with own splats: "smooth" shapes them by their neighbours, so that a pool is flat and a drop round
+    surface: Literal["particles", "smooth"] = "particles"
+    transparency: Annotated[float, Limits(0, 1)] = 0.0  # of own splats: 0 as in the capture, 1 not there
+    sheen: Annotated[float, Limits(0, 1)] = 0.0  # of a smooth surface: brighter where it is seen at a low angle
     start: Annotated[float, Limits(0, 1e6, unit="s")] = 0.0  # simulated time until which it is held rigid and still
     density: Annotated[float, Limits(unit="kg/m³")] | None = None
     young: Annotated[float, Limits(unit="Pa")] | None = None
@@ -229,6 +243,7 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     fibre_stiffness: Annotated[float, Limits(unit="Pa")] | None = None
     fibre_azimuth: Annotated[float, Limits(unit="rad")] | None = None
     fibre_elevation: Annotated[float, Limits(unit="rad")] | None = None
+    section: ClassVar[str] = "objects"
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """A fixed object neither moves nor has a material, and one that is removed is not there."""
@@ -245,10 +260,17 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
                 yield name, not any(getattr(self, name)), "a fixed object does not move; remove one of the two"
             yield "rigid", not self.rigid, "a fixed object does not move; remove one of the two"
             yield "start", self.start == 0, "a fixed object does not move; remove one of the two"
+            yield "splats", self.splats == "carried", "a fixed object does not move; remove one of the two"
         rule = "a rigid object does not break; remove one of the two"
         yield "tearing_stretch", not self.rigid or self.tearing_stretch is None, rule
         yield "fill", self.fixed or not self.fill, "only a fixed object is filled; give fixed = true, or remove it"
         yield "fill", self.gaussians is None or not self.fill, "nothing hid an object from a file of its own; remove it"
+        yield "hollow", self.fixed or not self.hollow, "a vessel stands still; give fixed = true, or remove hollow"
+        for name, still in _OF_OWN_SPLATS.items():
+            rule = f'it belongs to splats of its own; give splats = "own" or "auto", or remove {name}'
+            yield name, self.splats != "carried" or getattr(self, name) == still, rule
+        smooth = self.surface == "smooth"
+        yield "sheen", smooth or not self.sheen, 'it needs the normals of a smooth surface; give surface = "smooth"'
         both = self.gaussians is not None and (self.within is not None or self.id is not None)
         yield "gaussians", not both, "a file of its own needs no id and no region; remove one of the two"
 
@@ -269,12 +291,12 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
         Raises:
             SceneError: no material, an unknown one, or numbers out of range.
         """
-        name = joined(name)
+        where = joined(self.section, name)
         if (self.material is None) == (self.model is None):
-            raise SceneError(f"objects.{name}: give either material (a preset) or model (a law with its numbers).")
+            raise SceneError(f"{where}: give either material (a preset) or model (a law with its numbers).")
         for key, value, known in (("material", self.material, PRESETS), ("model", self.model, LAWS)):
             if value is not None and value not in known:
-                raise SceneError(f"objects.{name}.{key} = {value!r}: {suggest(value, known)}.")
+                raise SceneError(f"{where}.{key} = {value!r}: {suggest(value, known)}.")
         settings: dict[str, Any] = dict(PRESETS[self.material]) if self.material else {"model": self.model}
         settings |= {key: value for key in _NUMBERS if (value := getattr(self, key)) is not None}
         if self.rigid:
@@ -285,83 +307,68 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
         elif self.tearing_stretch is not None and not settings["model"].startswith(TEARING):
             able = ", ".join(law.removeprefix(TEARING) for law in LAWS if law.startswith(TEARING))
             raise SceneError(
-                f"objects.{name}.tearing_stretch: only elastic matter tears, of model {able}; this is"
+                f"{where}.tearing_stretch: only elastic matter tears, of model {able}; this is"
                 f" {settings['model']}. Remove the field, or take such a material."
             )
         if "density" not in settings:
-            raise SceneError(f"objects.{name}.density is missing: give it in kg/m³.")
+            raise SceneError(f"{where}.density is missing: give it in kg/m³.")
         try:
             return Material(**settings)
-        except InputError as error:
-            raise SceneError(f"objects.{name}.{error}") from None
-
-
-class ColliderSpec(Section, frozen=True, kw_only=True):
-    """Fields of all colliders: contact, pose and motion; the numbers of `Collider`."""
-
-    # Coulomb's coefficient in mode "separate"; 0.5 is that of many dry pairs
-    friction: Annotated[float, _FRICTION] = 0.5
-    # "sticky" holds matter, "slip" lets it slide but not leave, "separate" lets it slide with friction and leave
-    mode: Literal["sticky", "slip", "separate"] = "separate"
-    velocity: Annotated[Triple, _SPEED] | None = None  # of a collider that moves; None: it is still
-    # about its pivot; None: it does not turn
-    angular_velocity: Annotated[Triple, Limits(-1e6, 1e6, unit="rad/s")] | None = None
-    rotation: Annotated[tuple[float, float, float, float], _WEIGHT] | None = None  # quaternion wxyz; None: not turned
-    pivot: Annotated[Triple, _PLACE] | None = None  # centre of its rotation; None: its middle
-    shape: ClassVar[type[Collider]]
-
-    def to_collider(self, where: str) -> Collider:
-        """The collider of these fields.
-
-        Raises:
-            SceneError: a number is out of range.
-        """
-        try:
-            return self.shape(**{name: value for name, value in asdict(self).items() if value is not None})
         except InputError as error:
             raise SceneError(f"{where}.{error}") from None
 
 
-class PlaneSpec(ColliderSpec, frozen=True, kw_only=True):
-    """A half space that matter cannot enter."""
+_SHAPES = {"a box": ("lower", "upper"), "a ball": ("centre", "radius"), "a cylinder": ("bottom", "top", "radius")}
+_FILLED = {"a vessel": ("fills",), **_SHAPES}
 
-    point: Annotated[Triple, _PLACE]  # on the plane
-    normal: Annotated[Triple, _WEIGHT]  # of any length, towards the free side
-    shape = Plane
-
-
-class BoxSpec(ColliderSpec, frozen=True, kw_only=True):
-    """A solid box, along the axes unless turned."""
-
-    lower: Annotated[Triple, _PLACE]  # corner
-    upper: Annotated[Triple, _PLACE]  # corner
-    shape = Box
+# fields of an object that a volume has not
+_OF_CAPTURED = (
+    "id", "gaussians", "within", "height", "offset", "rotation", "scale", "copies", "removed", "fixed", "fill",
+    "hollow",
+)  # fmt: skip
 
 
-class SphereSpec(ColliderSpec, frozen=True, kw_only=True):
-    """A solid ball."""
+class VolumeSpec(ObjectSpec, frozen=True, kw_only=True):
+    """Matter that nobody captured: it fills a vessel of the scene, a box, a ball or a cylinder.
 
-    centre: Annotated[Triple, _PLACE]  # of the ball
-    radius: Annotated[float, _LENGTH]  # of the ball
-    shape = Sphere
+    It has the fields of an object that say of what it is and how it moves and looks, and always splats of its own.
+    """
 
+    colour: Annotated[Triple, Limits(0, 1)]  # of its splats
+    grain: Annotated[float, Limits(0, 1)] = 0.0  # by which the brightness of its splats varies, one standard deviation
+    fills: str | None = None  # name of the hollow object that it is in
+    level: Annotated[float, Limits(0, 1, above=True)] = 0.8  # share of the vessel's depth
+    lower: Annotated[Triple, _PLACE] | None = None  # corner of a box
+    upper: Annotated[Triple, _PLACE] | None = None  # corner of a box
+    centre: Annotated[Triple, _PLACE] | None = None  # of a ball
+    radius: Annotated[float, _LENGTH] | None = None  # of a ball, or of a cylinder
+    bottom: Annotated[Triple, _PLACE] | None = None  # centre of an end of a cylinder
+    top: Annotated[Triple, _PLACE] | None = None  # centre of the other end
+    keep: Literal["parts", "largest", "all"] = "all"  # it has no outliers
+    splats: Literal["carried", "own", "auto"] = "own"  # it has no others
+    surface: Literal["particles", "smooth"] = "smooth"  # of a fluid
+    section: ClassVar[str] = "volumes"
 
-class CapsuleSpec(ColliderSpec, frozen=True, kw_only=True):
-    """A solid rod with round ends about two points of its axis."""
-
-    start: Annotated[Triple, _PLACE]  # of its axis
-    end: Annotated[Triple, _PLACE]  # of its axis
-    radius: Annotated[float, _LENGTH]  # about its axis
-    shape = Capsule
-
-
-class CylinderSpec(ColliderSpec, frozen=True, kw_only=True):
-    """A solid cylinder with flat ends in two points of its axis."""
-
-    start: Annotated[Triple, _PLACE]  # of its axis
-    end: Annotated[Triple, _PLACE]  # of its axis
-    radius: Annotated[float, _LENGTH]  # about its axis
-    shape = Cylinder
+    def rules(self) -> Iterable[tuple[str, bool, str]]:
+        """One shape is given, and nothing that only captured objects have."""
+        yield from super().rules()
+        for name in _OF_CAPTURED:
+            still = getattr(self, name) == getattr(ObjectSpec(), name)
+            yield name, still, "it belongs to captured objects; a volume lies where its shape says; remove it"
+        yield "splats", self.splats == "own", "a volume has no other splats than its own; remove the field"
+        names = dict.fromkeys(name for shape in _FILLED.values() for name in shape)
+        given = {name for name in names if getattr(self, name) is not None}
+        every = "; ".join(f"{what} has {' and '.join(shape)}" for what, shape in _FILLED.items())
+        fitting = [shape for shape in _FILLED.values() if given == set(shape)]
+        at = next((name for name in names if name in given), "fills")
+        yield at, bool(fitting), f"give one shape: {every}"
+        if not given >= {"fills"}:
+            yield "level", self.level == 0.8, "it belongs to a vessel; give fills, or remove it"
+        for a, b in (("lower", "upper"), ("bottom", "top")):
+            ends = getattr(self, a), getattr(self, b)
+            if None not in ends:
+                apart = ends[0] != ends[1] if a == "bottom" else all(low < high for low, high in zip(*ends))
+                yield b, apart, f"it must be above {a}" if a == "lower" else "it is the other end; move one of the two"
 
 
 class Scene(Section, frozen=True):
@@ -369,12 +376,14 @@ class Scene(Section, frozen=True):
 
     input: InputSpec  # files
     objects: dict[str, ObjectSpec]  # by name
+    volumes: dict[str, VolumeSpec] = field(default_factory=dict)  # matter poured into vessels and shapes, by name
     simulation: SimulationSpec = SimulationSpec()  # grid, frames, gravity
     world: WorldSpec = WorldSpec()  # axes and units of the files
     segmentation: SegmentationSpec = SegmentationSpec()  # thresholds of the vote
     clamp: ClampSpec = ClampSpec()  # bounds and weights of the eigen-clamp
     camera: CameraSpec = CameraSpec()  # of the video
     drawing: DrawingSpec = DrawingSpec()  # accuracy of the video
+    light: LightSpec | None = None  # casts shadows of moving matter; None: no shadows but those captured
     output: OutputSpec = OutputSpec()  # states that stay
     accuracy: Accuracy = "standard"  # sets the fields that the file leaves open, and scales its dx
     planes: dict[str, PlaneSpec] = field(default_factory=dict)  # colliders by name
@@ -388,7 +397,7 @@ class Scene(Section, frozen=True):
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """Something moves, objects can be told apart, one length gives the scale; forces, integrator and size fit."""
-        moving = sum(spec.moves for spec in self.objects.values())
+        moving = sum(spec.moves for spec in self.objects.values()) + len(self.volumes)
         yield "objects", moving > 0, "none moves; give one a material"
         owners: dict[int, str] = {}
         for name, spec in self.objects.items():
@@ -397,6 +406,14 @@ class Scene(Section, frozen=True):
                 rule = f"{spec.id} is the id of objects.{joined(owner)}, too; each object has an id of its own"
                 yield joined("objects", name, "id"), owner == name, rule
         moving_names = [name for name, spec in self.objects.items() if spec.moves]
+        moving_names += self.volumes
+        for name, spec in self.volumes.items():
+            yield joined("volumes", name), name not in self.objects, "is an object's name, too; name it otherwise"
+            hollow = [vessel for vessel, other in self.objects.items() if other.hollow]
+            rule = f"is no object with hollow = true; {suggest(str(spec.fills), hollow)}"
+            yield joined("volumes", name, "fills"), spec.fills is None or spec.fills in hollow, rule
+        laid = self.simulation.dx is not None or not self.volumes
+        yield "simulation.dx", laid, "it is missing: volumes are laid out on the grid; give it in m"
         for name, force in self.forces.items():
             for entry in force.objects or ():
                 known = entry in moving_names
@@ -527,7 +544,7 @@ def scene_from(
         scene = decode(with_level(values, level), Scene, folder=str(folder))
         if (dx := scene.simulation.dx) is not None:
             scene = replace(scene, simulation=replace(scene.simulation, dx=dx * LEVELS[level].coarsening))
-        for name, spec in scene.objects.items():
+        for name, spec in (scene.objects | scene.volumes).items():
             if spec.moves:
                 spec.to_material(name)
             if spec.within is not None:

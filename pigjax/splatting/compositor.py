@@ -119,7 +119,7 @@ def _forward(
         return blend.behind, planes + sum_channels(rows, alpha, blend, tau, config)
 
     def composite_pass(lists, state):
-        rows = _rows_of_lists(table, lists, config)
+        rows = rows_of_lists(table, lists, config)
 
         def composite_group(group):
             tiles, *state = group
@@ -127,7 +127,7 @@ def _forward(
             def visit_chunk(chunk, _, valid, state):
                 return jax.vmap(composite_chunk)(chunk, valid, *state)
 
-            return _walk_lists(rows, lists, tiles, tuple(state), visit_chunk, config)
+            return walk_lists(rows, lists, tiles, tuple(state), visit_chunk, config)
 
         state = lax.map(composite_group, (groups, *(_grouped(planes, groups) for planes in state)))
         return tuple(_ungrouped(planes, config) for planes in state)
@@ -171,7 +171,7 @@ def _composite_bwd(config: BlendConfig, saved: Any, cotangents: Any) -> tuple[Fl
 
     def pass_cotangent(lists, state):
         *state, of_table = state
-        rows, rows_vjp = jax.vjp(lambda table: _rows_of_lists(table, lists, config), table)
+        rows, rows_vjp = jax.vjp(lambda table: rows_of_lists(table, lists, config), table)
 
         def group_cotangent(of_rows, group):
             tiles, total, cotangent, *state = group
@@ -181,7 +181,7 @@ def _composite_bwd(config: BlendConfig, saved: Any, cotangents: Any) -> tuple[Fl
                 *state, change = jax.vmap(chunk_cotangent)(chunk, valid, transmittance, prefix, total, cotangent)
                 return *state, of_rows.at[slot.ravel()].add(change.reshape(-1, change.shape[-1]))
 
-            *state, of_rows = _walk_lists(rows, lists, tiles, (*state, of_rows), visit_chunk, config)
+            *state, of_rows = walk_lists(rows, lists, tiles, (*state, of_rows), visit_chunk, config)
             return of_rows, tuple(state)
 
         per_tile = (totals, cotangent, *state)
@@ -200,7 +200,7 @@ def _composite_bwd(config: BlendConfig, saved: Any, cotangents: Any) -> tuple[Fl
 composite_tiles.defvjp(_composite_fwd, _composite_bwd)
 
 
-def _walk_lists(
+def walk_lists(
     rows: Float[Array, "s f"],
     lists: TileLists,
     tiles: Int[Array, "b"],
@@ -212,6 +212,14 @@ def _walk_lists(
 
     `visit(chunk, slot, valid, state)` gets the next rows of each tile [b k f], and the slot that each came from; the
     state starts with the transmittance.
+
+    Args:
+        rows: of `rows_of_lists`.
+        lists: of one pass.
+        tiles: of the group; the number of tiles stands for one with an empty list.
+        state: of the group.
+        visit: one chunk of each of its tiles.
+        config: static settings.
     """
     bounds = jnp.append(lists.start, lists.start[-1])
     end, offsets = bounds[tiles + 1], jnp.arange(config.chunk)
@@ -229,8 +237,14 @@ def _walk_lists(
     return lax.while_loop(unfinished, one, (bounds[tiles], state))[1]
 
 
-def _rows_of_lists(table: Float[Array, "n f"], lists: TileLists, config: BlendConfig) -> Float[Array, "s f"]:
-    """Row of each slot of the lists, padded by a chunk, so that the last chunk may read past the end."""
+def rows_of_lists(table: Float[Array, "n f"], lists: TileLists, config: BlendConfig) -> Float[Array, "s f"]:
+    """Row of each slot of the lists, padded by a chunk, so that the last chunk may read past the end.
+
+    Args:
+        table: rows of `binning.rows_in_order`.
+        lists: of one pass.
+        config: static settings.
+    """
     owned = (lists.tile < config.tiles)[:, None]
     # a slot that no tile owns may hold a splat that is not finite
     rows = tile_polynomials(jnp.where(owned, table[lists.rank], 0.0), lists.tile, config)

@@ -42,20 +42,19 @@ def project_splats(splats: Splats, camera: Camera, config: RenderConfig) -> Proj
     row_x = (rotated[0] - clamped_u[:, None] * rotated[2]) * (fx / z)[:, None]
     row_y = (rotated[1] - clamped_v[:, None] * rotated[2]) * (fy / z)[:, None]
     a, b, c = (jnp.sum(p * q, 1) for p, q in ((row_x, row_x), (row_x, row_y), (row_y, row_y)))
-    opacities = splats.opacities
-    if config.antialias:
-        bare = jnp.maximum(a * c - b * b, 0.0)
-        a, c = a + config.dilation, c + config.dilation
-        flat = bare <= 0  # a needle seen end on: the root's slope is infinite there
-        opacities = opacities * jnp.where(flat, 0.0, jnp.sqrt(jnp.where(flat, 1.0, bare) / (a * c - b * b)))
-    else:
-        a, c = a + config.dilation, c + config.dilation
+    bare = jnp.maximum(a * c - b * b, 0.0) if config.antialias else None
+    a, c = a + config.dilation, c + config.dilation
     # a needle's a·c and b·b cancel in float32; the dilated determinant is at least dilation²
     tiny = float(jnp.finfo(a.dtype).tiny)
     least = max(config.dilation**2, tiny)
     widest = jnp.sqrt(jnp.maximum(a * c - least, tiny))
     b = jnp.clip(b, -widest, widest)
     determinant = jnp.maximum(a * c - b * b, least)
+    opacities = splats.opacities
+    if bare is not None:
+        # 0 where a needle is seen end on: the root's slope is infinite there
+        kept = jnp.minimum(bare / determinant, 1.0)
+        opacities = opacities * jnp.where(bare > 0, jnp.sqrt(jnp.where(bare > 0, kept, 1.0)), 0.0)
     conics = jnp.stack([c, -b, a], 1) / determinant[:, None]
     centres = jnp.stack([fx * u + cx, fy * v + cy], 1)
 

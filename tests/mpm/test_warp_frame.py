@@ -139,7 +139,7 @@ def test_one_particle_falls_freely_in_both_precisions():
     """Closed form: alone and away from all walls a particle falls by g t (t + dt) / 2."""
     for dtype in (jnp.float32, jnp.float64):
         with jax.enable_x64(dtype == jnp.float64):
-            numbers = in_precision(setting(v=np.zeros((1, 3))), dtype) | {"young": jnp.zeros((), dtype)}
+            numbers = in_precision(setting(v=np.zeros((1, 3))), dtype)
             start = jnp.asarray([[0.6, 0.65, 0.9]], dtype)
             (x, *_), health = simulate("frames", numbers, x=start, laws=BOTH[:1])
             dt, steps = 1e-3, 12

@@ -15,6 +15,7 @@ from pigjax.clamp import ClampParams
 from pigjax.core.arrays import einsum
 from pigjax.coupling.binding import Binding, deform
 from pigjax.mpm import Particles
+from pigjax.scene.own import Liquids
 from pigjax.splat import Gaussians
 
 MODES = ("aligned", "literal", "covariance", "fixed")
@@ -27,13 +28,17 @@ class Poser:
         gaussians: the scene at rest.
         particles: at rest, of `seed_particles`.
         binding: carriers of Gaussians without a particle; None: there are none.
+        liquids: fluids with a smooth surface; None: there are none.
     """
 
-    def __init__(self, gaussians: Gaussians, particles: Particles, binding: Binding | None) -> None:
-        self.gaussians, self.particles, self.binding = gaussians, particles, binding
+    def __init__(
+        self, gaussians: Gaussians, particles: Particles, binding: Binding | None, liquids: Liquids | None = None
+    ) -> None:
+        self.gaussians, self.particles, self.binding, self.liquids = gaussians, particles, binding, liquids
         own = np.asarray(particles.gaussian)
         self._with_gaussian = np.flatnonzero(own >= 0)
         carried = [own[self._with_gaussian]] + ([] if binding is None else [np.asarray(binding.gaussian)])
+        carried += [] if binding is None or binding.own is None else [np.asarray(binding.own.gaussian)]
         self.rows: Int[np.ndarray, "m"] = np.concatenate(carried)  # indices of the moving Gaussians
 
     def pose(
@@ -48,6 +53,8 @@ class Poser:
         moved = eqx.tree_at(
             lambda p: (p.x, p.F_visual), self.particles, (jnp.asarray(x, kind), jnp.asarray(F_visual, kind))
         )
+        if self.liquids is not None:
+            _, moved = self.liquids(self.gaussians, moved)
         means, covariances = _pose(self.gaussians, moved, self.binding, jnp.asarray(self.rows), clamp, mode)
         return np.asarray(means), np.asarray(covariances)
 
@@ -57,7 +64,8 @@ class Poser:
         if self.binding is None:
             return own
         shared = np.sum(np.asarray(self.binding.weights) * values[np.asarray(self.binding.particles)], 1)
-        return np.concatenate([own, shared])
+        made = self.binding.own
+        return np.concatenate([own, shared] + ([] if made is None else [values[np.asarray(made.rows[made.at])]]))
 
 
 @partial(jax.jit, static_argnames="mode")

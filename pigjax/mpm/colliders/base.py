@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 from pigjax.core.arrays import as_real, static_field
 from pigjax.core.checks import ANY, is_numeric, shown
 from pigjax.core.errors import InputError
-from pigjax.core.linalg import quat_multiply, quat_to_matrix, safe_norm, safe_normalize
+from pigjax.core.linalg import quat_multiply, quat_to_matrix, safe_norm, safe_normalize, safe_ratio
 
 MODES = ("sticky", "slip", "separate")
 _TOGETHER = 16384  # points of `distances_of` at once
@@ -192,13 +192,13 @@ class Collider(eqx.Module):
         glide = safe_norm(tangential)[..., None]
         if press is not None:
             bound = self.friction * press.speed
-            drag = jnp.where(glide > bound, bound / jnp.where(glide > bound, glide, 1.0), press.speed > 0)
+            drag = jnp.where(glide > bound, safe_ratio(bound, jnp.where(glide > bound, glide, 1.0)), press.speed > 0)
             drag = lax.stop_gradient(drag) if press.secant else drag
             return (1 - drag) * tangential + jnp.maximum(speed, 0.0) * normal
         # Coulomb: the tangential impulse is at most the friction coefficient times the normal one, which is -speed.
         # No division by speeds too slow to glide: the slope at almost no glide would be infinity times zero.
         glides = (speed < 0) & (glide >= -self.friction * speed)
-        kept = jnp.where(glides, 1 + self.friction * speed / jnp.where(glides & (glide > 0), glide, 1.0), 0.0)
+        kept = jnp.where(glides, 1 + safe_ratio(self.friction * speed, jnp.where(glides, glide, 1.0)), 0.0)
         return jnp.where(speed < 0, kept * tangential, relative)
 
     def _distance_and_normals(self, points: Points, time: Time) -> tuple[Float[Array, "*n"], Points]:

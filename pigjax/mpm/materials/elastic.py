@@ -88,16 +88,16 @@ def left_stretch(F: Tensors, b: Tensors, J: Scalars) -> Tensors:
     first = _first_invariant(b, J)
     second = (first * first - trace(b)) / 2
     determinant_of_sums = first * second - J
+    ill = (determinant_of_sums < ILL_CONDITIONED * first**3) | (determinant_of_sums == 0)  # the latter at F = 0
 
     def closed_form():
         numerator = first * J * identity(b) + (first * first - second) * b - product(b, b)
-        return numerator / jnp.where(determinant_of_sums > 0, determinant_of_sums, 1.0)
+        return numerator / jnp.where(ill, 1.0, determinant_of_sums)
 
     def by_polar():
         rotation, _ = linalg.polar(jnp.moveaxis(F, (0, 1), (-2, -1)))
         return product(jnp.moveaxis(rotation, (-2, -1), (0, 1)), transpose(F))
 
-    ill = determinant_of_sums < ILL_CONDITIONED * first**3
     return lax.cond(~everywhere(~jnp.any(ill)), lambda: jnp.where(ill, by_polar(), closed_form()), closed_form)
 
 
@@ -112,7 +112,9 @@ def _first_invariant(b: Tensors, J: Scalars) -> Scalars:
 
     def newton(y, tr, J, constant):
         slope = 4 * y * (y * y - tr) - 8 * J
-        return y - ((y * y - 2 * tr) * y * y - 8 * J * y + constant) / jnp.where(slope > 0, slope, jnp.inf)
+        # below, the closed form is ill-conditioned and not used: the slope is 8 (s₁+s₂)(s₂+s₃)(s₃+s₁) at the root
+        usable = slope > 0.1 * y**3
+        return y - ((y * y - 2 * tr) * y * y - 8 * J * y + constant) / jnp.where(usable, slope, jnp.inf)
 
     fixed = jax.tree.map(lax.stop_gradient, coefficients)
 

@@ -1,11 +1,13 @@
-"""Any value in any field of the settings: prints what is neither legal nor refused by name. Run without type checks."""
+"""Any value in any field of the settings: it is legal or refused by name."""
 
 import dataclasses
 import math
+from typing import Any
 
 import jax
 import numpy as np
 
+from benchmarks.extremes.judging import FAULT, FINITE, REFUSED, Outcome
 from pigjax.clamp import ClampParams
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
@@ -20,7 +22,7 @@ from pigjax.splat import RenderConfig
 from pigjax.study.optimize import Bounds
 
 HUGE = (1e30, 2**40, 10**400)
-ODD = (np.array(["a"]), np.array([None]), [[1], [1, 2]], 1 + 2j, np.ones((2, 5)), jax.random.key(0), np.uint64(2**63))
+ODD = (np.array(["a"]), np.array([None]), [[1], [1, 2]], 1 + 2j, np.ones((2, 5)), "key", np.uint64(2**63))
 VALUES = (math.nan, math.inf, -math.inf, -1, 0, *HUGE, 1e-45, "text", [], {}, None, True, (math.nan,) * 3, *ODD)
 ZERO, ONE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 MADE = [
@@ -47,7 +49,32 @@ MADE = [
 ]
 
 
-def fault(made, field, value):
+def outcomes() -> dict[str, Outcome]:
+    """What becomes of every value in every field; run it without type checks of jaxtyping."""
+    found = {}
+    for cls, base in MADE:
+        for field in dataclasses.fields(cls):
+            for number, given in enumerate(VALUES):
+                value = jax.random.key(0) if isinstance(given, str) and given == "key" else given
+                huge = isinstance(value, int | float) and value in HUGE
+                where = f"{cls.__name__}.{field.name} = {f'huge {number}' if huge else str(given)[:30]}"
+                found[where] = _outcome(cls, base, field, value)
+    return found
+
+
+def _outcome(cls: type, base: dict[str, Any], field: Any, value: Any) -> Outcome:
+    try:
+        said = _fault(cls(**{**base, field.name: value}), field, value)
+    except InputError as error:
+        if field.name not in str(error) or "\n" in str(error):
+            return Outcome(FAULT, f"not named: {error}")
+        return Outcome(REFUSED, str(error))
+    except Exception as error:
+        return Outcome(FAULT, f"{type(error).__name__} {str(error)[:150]!r}")
+    return Outcome(FINITE) if said is None else Outcome(FAULT, said)
+
+
+def _fault(made: Any, field: Any, value: Any) -> str | None:
     """What is wrong with a value that was accepted; None where it is legal."""
     own = getattr(made, field.name)
     if dataclasses.is_dataclass(own):
@@ -57,18 +84,3 @@ def fault(made, field, value):
             return f"accepted {own}"
     wrong = isinstance(value, str | list | dict) and own is value
     return "accepted type" if wrong or (value is True and "bool" not in str(field.type)) else None
-
-
-for cls, base in MADE:
-    for field in dataclasses.fields(cls):
-        for value in VALUES:
-            huge = isinstance(value, int | float) and value in HUGE
-            where = f"{cls.__name__}.{field.name} = {'huge' if huge else str(value)[:30]}"
-            try:
-                said = fault(cls(**{**base, field.name: value}), field, value)
-            except InputError as error:
-                said = f"not named: {error}" if field.name not in str(error) or "\n" in str(error) else None
-            except Exception as error:
-                said = f"{type(error).__name__} {str(error)[:150]!r}"
-            if said is not None:
-                print(f"{where}: {said}")

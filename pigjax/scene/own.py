@@ -1,0 +1,242 @@
+"""Splats of its own in a scene: which objects get them, how they join the scene's Gaussians, and liquid surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from pigjax import io
+from pigjax.core.gaussians import SH_CONSTANT
+from pigjax.coupling.binding import bind
+from pigjax.coupling.liquid import Kernels, LiquidRest, liquid_kernels, liquid_rest, sheen, smoothed, with_kernels
+from pigjax.coupling.own_splats import OwnSplats, make_own_splats
+from pigjax.mpm import Particles
+from pigjax.scene.arrangement import appended, with_bands
+from pigjax.scene.plan import Inputs, Plan
+from pigjax.scene.schema import Scene, VolumeSpec
+from pigjax.scene.world import axis_of
+from pigjax.splat import Gaussians
+
+FLOWING = ("drucker_prager", "snow", "fluid", "foam", "plasticine")  # laws whose matter "auto" draws by own splats
+_TORN = 3.0  # stretch of a particle that its neighbours no longer share [-]
+_TORN_SHARE = 0.01  # of an object's particles, from which it counts as torn
+MADE = "own_splats"  # prefix of the arrays in the file of the rest state that a later run may use again
+
+
+@dataclass
+class Liquid:
+    """A fluid whose splats are shaped by their neighbours."""
+
+    rows: Int[np.ndarray, "p"]  # its particles
+    rest: LiquidRest
+    sheen: float  # 0 to 1
+    splats: Int[np.ndarray, "m"]  # its Gaussians
+    at: Int[np.ndarray, "m"]  # place of the carrier of each in `rows`
+
+
+@dataclass
+class Liquids:
+    """The fluids of a scene that are drawn with a smooth surface."""
+
+    parts: list[Liquid]
+    dx: float  # [m]
+
+    def __call__(self, gaussians: Gaussians, particles: Particles) -> tuple[Gaussians, Particles]:
+        """Gaussians with their sheen, and particles whose positions and deformations pose smooth surfaces. Host."""
+        x, F = np.array(particles.x), np.array(particles.F_visual)
+        sh = np.array(gaussians.sh) if any(part.sheen for part in self.parts) else None
+        for part in self.parts:
+            here, now = x[part.rows], liquid_kernels(x[part.rows].astype(np.float64), dx=self.dx)
+            x[part.rows], F[part.rows] = smoothed(here, F[part.rows], part.rest, dx=self.dx, now=now)
+            if sh is not None and part.sheen:
+                sh[part.splats] = _shining(sh[part.splats], F[part.rows], now, part)
+        particles = eqx.tree_at(lambda p: (p.x, p.F_visual), particles, (jnp.asarray(x), jnp.asarray(F)))
+        return gaussians if sh is None else replace(gaussians, sh=jnp.asarray(sh)), particles
+
+
+def _shining(
+    sh: Float[np.ndarray, "m k 3"], F: Float[np.ndarray, "p 3 3"], now: Kernels, part: Liquid
+) -> Float[np.ndarray, "m k 3"]:
+    """Colours with a sheen about the surface as it is now, in the rest frame of each splat, which F turns."""
+    u, _, vt = np.linalg.svd(np.where(np.isfinite(F).all((1, 2))[:, None, None], F, np.eye(3)).astype(np.float64))
+    normals = np.einsum("pij,pjk,pk->pi", vt.swapaxes(1, 2), u.swapaxes(1, 2), now.normals)
+    colour = np.clip(sh[:, 0] * SH_CONSTANT + 0.5, 0, 1)
+    added = sheen(normals, part.sheen * now.sided)[part.at]
+    shining = sh.copy()
+    shining[:, :9] += (added[..., None] * (1 - colour)[:, None]).astype(sh.dtype)
+    return shining
+
+
+def chosen(scene: Scene, laws: Mapping[str, str], torn: Callable[[str], bool]) -> list[str]:
+    """Names of the objects that are drawn by splats of their own.
+
+    Args:
+        scene: with `splats` of its objects.
+        laws: law of each moving object.
+        torn: whether an object that neither flows nor breaks by its law was torn.
+    """
+    wanted = {name: scene.objects[name].splats for name in laws}
+    return [
+        name for name, kind in wanted.items()
+        if kind == "own" or (kind == "auto" and (laws[name] in FLOWING or torn(name)))
+    ]  # fmt: skip
+
+
+def laws_of(scene: Scene, plan: Plan) -> dict[str, str]:
+    """Law of each moving object."""
+    return dict(zip([name for name, entry in scene.objects.items() if not entry.fixed], plan.table.laws))
+
+
+def is_torn(F: Float[np.ndarray, "p 3 3"]) -> bool:
+    """Whether matter was torn: more than a hundredth of its particles are stretched threefold. Host."""
+    F = np.nan_to_num(np.asarray(F, np.float64), posinf=0, neginf=0)
+    squared = np.linalg.eigvalsh(np.einsum("pji,pjk->pik", F, F))
+    return bool(np.mean(squared[:, -1] > _TORN**2) > _TORN_SHARE)
+
+
+def with_own(
+    scene: Scene,
+    inputs: Inputs,
+    plan: Plan,
+    names: list[str],
+    *,
+    stored: Mapping[str, np.ndarray] | None = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> tuple[Inputs, Plan, dict[str, np.ndarray]]:
+    """Inputs and plan in which some objects are drawn by splats of their own. Host.
+
+    The Gaussians of these objects give way to their own splats, which come last; their particles carry none, and the
+    binding knows who carries which.
+
+    Args:
+        scene: as it was read.
+        inputs: its files.
+        plan: of `make_plan`.
+        names: objects that get them; none changes nothing.
+        stored: arrays of an earlier call, which are used again if they were made from the same.
+        say: told a line about each object.
+
+    Returns:
+        Inputs, plan, and arrays to store.
+    """
+    if not names:
+        return inputs, plan, {}
+    moving = list(laws_of(scene, plan))
+    object_id, body = np.asarray(plan.labels.object_id), np.asarray(plan.particles.body)
+    x = np.asarray(plan.particles.x)
+    parts: list[tuple[Gaussians, np.ndarray]] = []
+    arrays: dict[str, np.ndarray] = {}
+    for number, name in enumerate(names):
+        entry = scene.objects[name]
+        rows = np.flatnonzero(body == moving.index(name))
+        if isinstance(entry, VolumeSpec):
+            poured = _of_volume(inputs.gaussians, plan, rows, entry.surface == "smooth")
+            parts.append((_fainter(poured, entry.transparency), rows))
+            continue
+        members = np.flatnonzero(object_id == inputs.ids[name])
+        mine = jax.tree.map(lambda values, members=members: values[members], inputs.gaussians)
+        mark = io.digest(mine, x[rows], plan.dx, entry.inside, make_own_splats)
+        made = _stored(stored or {}, f"{MADE}_{number}", mark)
+        if made is None:
+            axis = axis_of(scene.input.up)
+            made = make_own_splats(mine, x[rows], dx=plan.dx, up=axis, inside=entry.inside)
+            say(
+                f"{name}: {len(mine)} Gaussians give way to {len(made.gaussians)} splats of its own; at rest"
+                f" {made.psnr:.1f} dB to them in views not fitted ({made.start:.1f} before the fit);"
+                f" {made.seconds:.0f} s."
+            )
+        arrays |= _arrays(made, f"{MADE}_{number}", mark)
+        parts.append((_fainter(made.gaussians, entry.transparency), rows[made.carrier]))
+    kept = np.flatnonzero(~np.isin(object_id, [inputs.ids[name] for name in names]))
+    place = np.full(len(object_id) + 1, -1)
+    place[kept] = np.arange(len(kept))
+    everything = jax.tree.map(
+        lambda old, *new: jnp.concatenate([old[kept], *new]), inputs.gaussians, *(part for part, _ in parts)
+    )
+    labels = replace(plan.labels, **{f: getattr(plan.labels, f)[kept] for f in ("object_id", "votes", "confidence")})
+    labels = appended(labels, [len(part) for part, _ in parts], [inputs.ids[name] for name in names])
+    carrier = np.concatenate([np.full(len(kept), -1), *(carriers for _, carriers in parts)])
+    particles = replace(plan.particles, gaussian=jnp.asarray(place[np.asarray(plan.particles.gaussian)], jnp.int32))
+    binding = bind(everything, labels, particles, carrier=carrier, dx=plan.dx)
+    laws = laws_of(scene, plan)
+    smooth = [n for n in names if scene.objects[n].surface == "smooth" and laws[n] == "fluid"]
+    sheens = [scene.objects[name].sheen for name in smooth]
+    if any(sheens):
+        everything = with_bands(everything, max(9, everything.sh.shape[1]))
+    arrays |= {
+        "carrier": carrier,
+        "smooth": np.asarray([inputs.ids[name] for name in smooth], int),
+        "sheen": np.asarray(sheens, float),
+    }
+    inputs = replace(inputs, gaussians=everything, arranged=True)
+    return inputs, replace(plan, particles=particles, labels=labels, binding=binding), arrays
+
+
+def _of_volume(gaussians: Gaussians, plan: Plan, rows: Int[np.ndarray, "p"], smooth: bool) -> Gaussians:
+    """Splats of matter that was poured: those that its particles have, on a smooth surface where it is a fluid."""
+    carried = np.asarray(plan.particles.gaussian)[rows]
+    mine = jax.tree.map(lambda values: values[carried], gaussians)
+    law = plan.table.laws[int(np.asarray(plan.particles.body)[rows[0]])]
+    if not (smooth and law == "fluid"):
+        return mine
+    return with_kernels(mine, liquid_kernels(np.asarray(plan.particles.x, np.float64)[rows], dx=plan.dx))
+
+
+def _fainter(gaussians: Gaussians, transparency: float) -> Gaussians:
+    """Splats with their opacities times what is left of them."""
+    if transparency == 0:
+        return gaussians
+    opacity = jax.nn.sigmoid(gaussians.logit_opacities) * (1 - transparency)
+    return replace(gaussians, logit_opacities=jax.scipy.special.logit(jnp.maximum(opacity, 1e-6)))
+
+
+def _arrays(made: OwnSplats, prefix: str, mark: str) -> dict[str, np.ndarray]:
+    arrays: dict[str, Any] = {f.name: getattr(made.gaussians, f.name) for f in fields(Gaussians)}
+    arrays |= {"carrier": made.carrier, "scores": np.array([made.psnr, made.start, made.seconds]), "mark": mark}
+    return {f"{prefix}_{name}": np.asarray(values) for name, values in arrays.items()}
+
+
+def _stored(arrays: Mapping[str, np.ndarray], prefix: str, mark: str) -> OwnSplats | None:
+    """Splats of an earlier run, where they were made from the same."""
+    if f"{prefix}_mark" not in arrays or str(arrays[f"{prefix}_mark"]) != mark:
+        return None
+    gaussians = Gaussians(**{f.name: jnp.asarray(arrays[f"{prefix}_{f.name}"]) for f in fields(Gaussians)})
+    return OwnSplats(gaussians, arrays[f"{prefix}_carrier"], *arrays[f"{prefix}_scores"].tolist())
+
+
+def liquids_of(
+    smooth: Mapping[int, float],
+    objects: Int[np.ndarray, "p"],
+    x: Float[Array, "p 3"],
+    carrier: Int[np.ndarray, "n"],
+    dx: float,
+) -> Liquids | None:
+    """Surfaces at rest of the fluids that are drawn smooth; None where there are none. Host.
+
+    Args:
+        smooth: sheen of each of these fluids, by its id.
+        objects: id of each particle's object.
+        x: particles at rest [m].
+        carrier: particle of each Gaussian, -1 for those that were not made for their matter.
+        dx: grid spacing [m].
+    """
+    parts = []
+    for number, strength in smooth.items():
+        rows = np.flatnonzero(objects == number)
+        splats = np.flatnonzero(np.isin(carrier, rows))
+        rest = liquid_rest(np.asarray(x)[rows], dx=dx)
+        parts.append(Liquid(rows, rest, strength, splats, np.searchsorted(rows, carrier[splats])))
+    return Liquids(parts, dx) if parts else None
+
+
+def smooth_of(arrays: Mapping[str, np.ndarray]) -> dict[int, float]:
+    """Sheen of each fluid that is drawn smooth, by its id, from the arrays of `with_own`."""
+    ids = arrays.get("smooth", np.zeros(0, int))
+    return dict(zip(np.asarray(ids).tolist(), np.asarray(arrays.get("sheen", np.zeros(len(ids)))).tolist()))
