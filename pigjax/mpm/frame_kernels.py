@@ -166,10 +166,9 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
                 if cell[i] > held[i]:
                     sides[b, 2 * i + 1] = 1
                     out = int(1)
-                low, high = numbers[b, wp.static(LOW) + i], numbers[b, wp.static(HIGH) + i]
-                if cell[i] < low and cell[i] < before[i] - real(wp.static(still)):
+                if cell[i] < numbers[b, wp.static(LOW) + i] and cell[i] < before[i] - real(wp.static(still)):
                     hit = int(1)
-                if cell[i] > high and cell[i] > before[i] + real(wp.static(still)):
+                if cell[i] > numbers[b, wp.static(HIGH) + i] and cell[i] > before[i] + real(wp.static(still)):
                     hit = int(1)
             if out == 1:
                 wp.atomic_add(counts, b, step, 0, 1)

@@ -27,7 +27,7 @@ BOTH = ("fixed_corotated", "neo_hookean")
 ROADS = {"frames": {"backend": "warp", "whole_frames": True}, "xla": {"backend": "xla"}}
 X = np.random.default_rng(1).uniform(0.45, 0.8, (24, 3))
 V = np.random.default_rng(2).normal(size=(24, 3)) * 3
-WILD = V * np.where(np.arange(24) % 5 == 0, 60.0, 1.0)[:, None]  # some leave the grid, others are turned inside out
+WILD = V * np.where(np.arange(24) % 5 == 0, 600.0, 1.0)[:, None]  # some leave the grid, others are turned inside out
 LOST = np.where(np.arange(24)[:, None] == 7, np.inf, V)
 
 
