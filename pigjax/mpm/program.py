@@ -164,13 +164,13 @@ def run_frames(
     )
     run = partial(_frames, statics, config, frames, inputs.substeps, of or frames)
     if devices > 1:
-        whole, shared = PartitionSpec(), PartitionSpec(AXIS)
+        all_of_it, shared = PartitionSpec(), PartitionSpec(AXIS)
         mesh = Mesh(np.array(jax.local_devices()[:devices]), (AXIS,))
         run = jax.shard_map(
             run,
             mesh=mesh,
-            in_specs=(whole, shared, whole),
-            out_specs=(shared, PartitionSpec(None, AXIS), whole),
+            in_specs=(all_of_it, shared, all_of_it),
+            out_specs=(shared, PartitionSpec(None, AXIS), all_of_it),
             check_vma=False,  # of loops whose carries would need marks
         )
     states, paths, (health, sides_met) = run(context, states, inputs.start)
