@@ -30,7 +30,15 @@ from pigjax.mpm import fit_grid
 WARP = importlib.util.find_spec("warp") is not None
 SPLAX = importlib.util.find_spec("splax") is not None
 BACKENDS = ("xla", "warp")
-MATTER = ((10_000, 64), (100_000, 64), (500_000, 128), (4_000_000, 256))  # particles, nodes a side
+# ways of a substep: by XLA, with the transfers by Warp, or whole frames by Warp
+ROADS = {
+    "xla": {"backend": "xla"},
+    "transfers": {"backend": "warp", "whole_frames": False},
+    "frames": {"backend": "warp", "whole_frames": True},
+}
+# particles, nodes a side
+MATTER = ((10_000, 64), (100_000, 64), (500_000, 128), (1_000_000, 128), (4_000_000, 256))
+GRADIENTS = ((10_000, 64), (100_000, 64), (1_000_000, 128))
 PICTURES = ((10_000, 256, 256), (100_000, 512, 512), (1_000_000, 1920, 1080))  # splats, pixels
 STEPS = 40  # substeps of a frame
 NO_GPU = "This machine has no CUDA device that JAX uses: nothing is timed."
@@ -58,10 +66,12 @@ def check(_):
     count, nodes = (20_000, 32) if on_gpu() else (300, 16)
     cases = [{}, {"kernel": "cubic"}, {"deterministic": True}] if on_gpu() else [{}]
     for case in cases:
-        heights = {name: _height(count, nodes, 8, name, **case) for name in BACKENDS}
+        roads = [name for name in ROADS if name != "frames" or "deterministic" not in case]
+        heights = {name: _height(count, nodes, 8, **ROADS[name], **case) for name in roads}
         found = {name: jax.jit(jax.value_and_grad(run))(start) for name, (run, start) in heights.items()}
         said = ", ".join(f"{key} {value}" for key, value in case.items())
-        tell(f"matter, 8 steps and their gradient {said}", found["warp"], found["xla"], 1e-3)
+        for name in roads[1:]:
+            tell(f"matter by {name}, 8 steps and their gradient {said}", found[name], found["xla"], 1e-3)
     gaussians, camera = ball(20_000, 256, 256) if on_gpu() else ball(300, 64, 48)
 
     def drawn(gaussians, backend):
@@ -78,21 +88,21 @@ def check(_):
 
 def matter(options):
     """Frames of 40 substeps of a falling cube, as `python -m benchmarks mpm speed`, and the bars of the issue."""
-    if not on_gpu():
+    if not (on_gpu() or options.tiny):
         return NO_GPU
     laws = ("fixed_corotated", "neo_hookean")
-    print(
-        head("M particle updates/s", "law", *BACKENDS, "warp, in order", "plain Warp", "warp / plain Warp", "peak GB")
-    )
+    columns = (*ROADS, "transfers, in order", "plain Warp", "frames / transfers", "frames / plain Warp", "peak GB")
+    print(head("M particle updates/s", "law", *columns))
     for count, nodes in _chosen(MATTER, options):
         for law in laws:
-            rates = [_rate(law, count, nodes, backend=name) for name in BACKENDS]
+            rates = [_rate(law, count, nodes, **road) for road in ROADS.values()]
+            gain = f"{rates[2] / rates[1]:.2f}"
             rates.append(_rate(law, count, nodes, backend="warp", deterministic=True))
             plain = _plain_rate(count, nodes) if law == "neo_hookean" else None
-            ratio = "" if plain is None else f"{rates[1] / plain:.2f}"
-            told = [f"{rate / 1e6:.0f}" for rate in rates]
-            print(row(f"{count // 1000}k/{nodes}³", law, *told, "" if plain is None else f"{plain / 1e6:.0f}", ratio,
-                      _peak()))  # fmt: skip
+            ratio = "" if plain is None else f"{rates[2] / plain:.2f}"
+            told = [f"{rate / 1e6:{'.3f' if options.tiny else '.0f'}}" for rate in rates]
+            print(row(f"{_size(count)}/{nodes}³", law, *told, "" if plain is None else f"{plain / 1e6:.0f}", gain,
+                      ratio, _peak()))  # fmt: skip
             gc.collect()
     return None
 
@@ -109,7 +119,7 @@ def _plain_rate(count, nodes):
     """Particle updates/s of plain Warp kernels, neo-Hookean, a frame captured as one CUDA graph."""
     from benchmarks.common.plain_warp import frame_in_a_graph
 
-    launch = frame_in_a_graph(count, nodes, STEPS, mpm.DT)
+    launch = frame_in_a_graph(count, nodes, STEPS, mpm.DT, "cuda:0" if on_gpu() else "cpu")
     launch()
     times = []
     for _ in range(5):
@@ -119,11 +129,11 @@ def _plain_rate(count, nodes):
     return count * STEPS / sorted(times)[2]
 
 
-def _height(count, nodes, steps, backend, **config):
+def _height(count, nodes, steps, **config):
     """Mean height after steps as a function of the velocities, and these."""
     particles, _, table = mpm.scene("neo_hookean", count, nodes)
     grid = fit_grid(particles.x, 1 / nodes, margin=2 / nodes)
-    settings = SimConfig(substeps=steps, devices=1, backend=backend, **config)
+    settings = SimConfig(substeps=steps, devices=1, **config)
 
     def height(v):
         moved = eqx.tree_at(lambda p: p.v, particles, v)
@@ -135,26 +145,29 @@ def _height(count, nodes, steps, backend, **config):
 
 def gradient(options):
     """The gradient of a frame, with checkpoints, in forward passes."""
-    if not on_gpu():
+    if not (on_gpu() or options.tiny):
         return NO_GPU
-    print(head("case", "backend", "forward ms", "forward and backward ms", "in forwards"))
-    for count, nodes in _chosen(MATTER[:3], options):
-        for name in BACKENDS:
-            height, v = _height(count, nodes, STEPS, name)
+    print(head("case", "road", "forward ms", "forward and backward ms", "in forwards"))
+    for count, nodes in _chosen(GRADIENTS, options):
+        for name, road in ROADS.items():
+            height, v = _height(count, nodes, STEPS, **road)
             runs = {"forward": jax.jit(height), "both": jax.jit(jax.value_and_grad(height))}
             forward, both = in_turn({key: partial(run, v) for key, run in runs.items()}, windows=7).values()
             times = (f"{1e3 * run.seconds:.2f}" for run in (forward, both))
-            print(row(f"{count // 1000}k/{nodes}³", name, *times, f"{both.over(forward):.2f}"))
+            print(row(f"{_size(count)}/{nodes}³", name, *times, f"{both.over(forward):.2f}"))
     return None
 
 
-def batch(_):
+def batch(options):
     """Sixteen simulations together by vmap, against one after another."""
-    if not on_gpu():
+    if not (on_gpu() or options.tiny):
         return NO_GPU
-    print(head("simulations of 10k/64³, 40 steps", "backend", "together ms", "one after another ms", "gain"))
-    for name in BACKENDS:
-        height, v = _height(10_000, 64, STEPS, name)
+    count, nodes = _chosen(MATTER, options)[0]
+    print(
+        head(f"simulations of {_size(count)}/{nodes}³, 40 steps", "road", "together ms", "one after another ms", "gain")
+    )
+    for name, road in ROADS.items():
+        height, v = _height(count, nodes, STEPS, **road)
         several = v + jnp.linspace(0, 1, 16)[:, None, None]
         single, together = jax.jit(height), jax.jit(jax.vmap(height))
         runs = {"together": partial(together, several), "serial": lambda s=single, v=several: [s(one) for one in v]}
@@ -241,7 +254,13 @@ def training(options):
 
 
 def _chosen(cases, options):
+    if options.tiny:
+        return ((400, 16),)
     return cases[: min(2, len(cases))] if options.quick else cases
+
+
+def _size(count):
+    return f"{count // 1_000_000}M" if count >= 1_000_000 else f"{count // 1000}k" if count >= 1000 else str(count)
 
 
 def _peak():
@@ -259,4 +278,10 @@ PARTS = {
     "demo": ("Demo", demo),
     "training": ("Reconstruction", training),
 }
-OPTIONS = {"quick": {"action": "store_true", "help": "the smaller half of the cases"}}
+OPTIONS = {
+    "quick": {"action": "store_true", "help": "the smaller half of the cases"},
+    "tiny": {
+        "action": "store_true",
+        "help": "matter, gradient and batch with 400 particles on any device: a rehearsal",
+    },
+}

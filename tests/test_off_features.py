@@ -114,6 +114,8 @@ def test_tracing_is_deterministic_and_this_test_sees_a_difference(plain):
         {"differentiation": "reverse"},
         {"backend": "xla"},
         {"deterministic": False},
+        {"whole_frames": None},
+        {"whole_frames": False},
         {"stop": False},
         {"force": True},  # of checks on the host only
     ],
@@ -143,7 +145,8 @@ def test_a_law_reads_its_own_numbers_only(law):
 # what only the feature's own equations hold
 SIGNS = {
     "cubic": (lambda: traced(kernel="cubic"), lambda p: "slice_sizes=(16,)" in text(p)),
-    "Warp kernels": (lambda: traced(backend="warp"), lambda p: primitives(p)["ffi_call"] > 0),
+    "Warp kernels": (lambda: traced(backend="warp", whole_frames=False), lambda p: primitives(p)["ffi_call"] > 1),
+    "whole frames": (lambda: traced(backend="warp"), lambda p: primitives(p)["ffi_call"] == 1),
     "body contact": (lambda: traced(contact=BodyContact(bodies=2)), lambda p: in_steps(p)["scatter-add"] > 1),
     "implicit steps": (lambda: traced(integrator="implicit"), lambda p: "while" in text(p)),
     "fibres": (lambda: traced([material("fibres")]), lambda p: primitives(p)["cos"] > 0),

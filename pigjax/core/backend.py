@@ -136,15 +136,28 @@ def launcher(kernel: Any, name: str, outputs: int, in_out: tuple[str, ...] = ())
     return launch
 
 
-def caller(function: Any, name: str, outputs: int, in_out: tuple[str, ...] = ()) -> Any:
-    """A function of Warp arrays, which launches on the host, as a function of JAX arrays; as `launcher` otherwise."""
+def caller(function: Any, name: str, outputs: int, in_out: tuple[str, ...] = (), graph_of: tuple[Any, ...] = ()) -> Any:
+    """A function of Warp arrays, which launches on the host, as a function of JAX arrays; as `launcher` otherwise.
+
+    Args:
+        function: of arrays; it returns nothing.
+        name: as of `launcher`.
+        outputs: as of `launcher`.
+        in_out: as of `launcher`.
+        graph_of: the kernels that it launches, if it neither allocates nor waits for the device: a CUDA device then
+            plays its launches back as one graph.
+    """
     warp = import_warp()
     function.__qualname__ = f"pigjax_{name}"
-    mode = warp.JaxCallableGraphMode.NONE
+    modes = warp.JaxCallableGraphMode
+    mode = modes.WARP if graph_of and _is_cuda() else modes.NONE
     call = warp.jax_callable(function, num_outputs=outputs, graph_mode=mode, in_out_argnames=list(in_out))
 
     def run(*arrays: Any, **sizes: Any) -> Any:
         call.call_id = 0
+        for kernel in graph_of if mode == modes.WARP else ():  # no module may be loaded while a graph is recorded
+            for device in jax.local_devices():
+                kernel.module.load(warp.device_from_jax(device))
         return call(*arrays, **sizes)
 
     return run

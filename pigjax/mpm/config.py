@@ -58,6 +58,9 @@ class SimConfig(eqx.Module):
     # of P2G and G2P: "xla", "warp" (extra `gpu`: CUDA devices and CPUs), or "auto": Warp on CUDA devices where it is
     # installed
     backend: str = static_field(default="auto", choices=BACKENDS)
+    # on Warp, all substeps of a frame in one call; True is refused where a scene does not qualify (docs/GPU.md), None:
+    # where it does
+    whole_frames: bool | None = static_field(default=None)
     # add the particles of a node in a fixed order, so that equal runs on one device give equal bits; a CPU always does
     # under XLA. Warp sorts the particles at each P2G for it
     deterministic: bool = static_field(default=False)

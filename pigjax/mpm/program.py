@@ -50,6 +50,7 @@ from pigjax.mpm.substep import (
     update_grid,
 )
 from pigjax.mpm.transfers import KERNELS
+from pigjax.mpm.warp_frame import obstacle, whole_frames
 
 AXIS = "particles"
 
@@ -125,6 +126,8 @@ def run_frames(
     states = tuple(_reorder(state, order) for state, order in zip(states, orders))
     points = grid.points
     still = grouping.still
+    laws = tuple(group.law for group in grouping.groups)
+    whole = _takes_whole_frames(config, inputs, laws, warp, devices)
     context = StepContext(
         parameters=tuple(group.parameters for group in grouping.groups),
         grid=grid,
@@ -145,7 +148,7 @@ def run_frames(
     statics = StepStatics(
         kernel=kernel,
         walls=config.walls,
-        laws=tuple(group.law for group in grouping.groups),
+        laws=laws,
         custom_vjp=config.differentiation == "reverse",
         solve_balance=balanced_velocity if config.integrator == "implicit" else None,
         newton_steps=config.newton_steps,
@@ -155,18 +158,19 @@ def run_frames(
         fillers=sum(-len(part) % devices for part, moves in zip(grouping.parts, grouping.moves) if moves),
         force_columns=columns_of(inputs.forces),
         warp=warp,
+        whole=whole,
         in_order=config.deterministic,
         contact_rounds=config.contact_rounds,
     )
     run = partial(_frames, statics, config, frames, inputs.substeps, of or frames)
     if devices > 1:
-        whole, shared = PartitionSpec(), PartitionSpec(AXIS)
+        all_of_it, shared = PartitionSpec(), PartitionSpec(AXIS)
         mesh = Mesh(np.array(jax.local_devices()[:devices]), (AXIS,))
         run = jax.shard_map(
             run,
             mesh=mesh,
-            in_specs=(whole, shared, whole),
-            out_specs=(shared, PartitionSpec(None, AXIS), whole),
+            in_specs=(all_of_it, shared, all_of_it),
+            out_specs=(shared, PartitionSpec(None, AXIS), all_of_it),
             check_vma=False,  # of loops whose carries would need marks
         )
     states, paths, (health, sides_met) = run(context, states, inputs.start)
@@ -190,11 +194,17 @@ def _frames(
     counts = [len(state.cells) for state in states]
     simple = not statics.custom_vjp or statics.solve_balance is not None
     steps_of_frame = _plain_steps if simple else _checkpointed_steps
+    whole_frame = None
+    if statics.whole:
+        whole_frame = whole_frames(statics, context, states, steps=substeps, block=_block(substeps, of))
 
     def frame(carry, _):
         states, worst, steps, stopped = carry
         chunks = tuple(to_chunks(state, len(state.cells) if statics.warp else config.chunk) for state in states)
-        chunks, health = steps_of_frame(statics, substeps, of, context, start, chunks, steps)
+        if whole_frame is None:
+            chunks, health = steps_of_frame(statics, substeps, of, context, start, chunks, steps)
+        else:
+            chunks, health = whole_frame(chunks)
         steps = steps + substeps
         moved = tuple(
             bound_visual(to_rows(chunk, count), config.visual_stretch) for chunk, count in zip(chunks, counts)
@@ -244,17 +254,40 @@ def _checkpointed_steps(
         jax.tree.map(lambda _: False, state)._replace(**dict.fromkeys(names, True))
         for state, names in zip(states, fixed)
     )
-    # Memory is least where a block has as many steps as the root of all steps. In a single frame the last block is not
-    # recomputed, so that longer blocks save time.
-    most = math.isqrt((2 if frames == 1 else 1) * frames * substeps)
-    block = -(-substeps // -(-substeps // most))
     perfect = partial(StepHealth.perfect, context.dt.dtype)
-    steps = Steps(begin, end, perfect, substeps, block, keep=frames == 1, passive=passive)
+    steps = Steps(begin, end, perfect, substeps, _block(substeps, frames), keep=frames == 1, passive=passive)
     after, health = run_steps(steps, (context, start), states, first)
     return tuple(
         new._replace(**{name: jnp.where(new.volume > 0, getattr(old, name), 0) for name in names})
         for old, new, names in zip(states, after, fixed)
     ), health
+
+
+def _block(substeps: int, frames: int) -> int:
+    """Steps of a block of the reverse mode.
+
+    Memory is least where a block has as many steps as the root of all steps. In a single frame the last block is not
+    recomputed, so that longer blocks save time.
+    """
+    most = math.isqrt((2 if frames == 1 else 1) * frames * substeps)
+    return -(-substeps // -(-substeps // most))
+
+
+def _takes_whole_frames(config: SimConfig, inputs: StepInputs, laws: tuple[str, ...], warp: bool, devices: int) -> bool:
+    """Whether the substeps of a frame are one call of Warp.
+
+    Raises:
+        InputError: that is asked for, and the scene does not qualify.
+    """
+    if config.whole_frames is False:
+        return False
+    contact, forces = inputs.contact is not None, bool(inputs.forces)
+    reason = obstacle(config, laws, inputs.colliders, warp=warp, devices=devices, contact=contact, forces=forces)
+    if reason is not None and config.whole_frames:
+        raise InputError(
+            f"SimConfig.whole_frames = True: {reason}; take None, which takes them where a scene qualifies."
+        )
+    return reason is None
 
 
 _FIXED = ("mass", "volume", "row", "weights")  # no step changes them, but to zero where a particle is no longer finite

@@ -65,6 +65,7 @@ class StepStatics(NamedTuple):
     fillers: int  # particles without mass that even out the devices' shares
     force_columns: tuple[int | None, ...] = ()  # row of `State.weights` that each force reads
     warp: bool = False  # whether the transfers are Warp kernels (`warp_transfers`), for all particles at once
+    whole: bool = False  # whether all steps of a frame are one call of Warp (`warp_frame`)
     in_order: bool = False  # whether these add to a node in a fixed order
     contact_rounds: int = 20  # in which contact of rigid bodies is solved
 
@@ -193,7 +194,7 @@ def grid_to_particles(
 
     vₚ = Σ wᵢₚ vᵢ, Cₚ = D⁻¹ Σ wᵢₚ vᵢ (xᵢ − xₚ)ᵀ, xₚ += Δt vₚ, and the law's F from (I + Δt Cₚ) F.
     """
-    inner = _between_walls(statics, context) if statics.walls is None else None
+    inner = between_walls(statics, context) if statics.walls is None else None
     health, moved = StepHealth.perfect(context.dt.dtype), []
     for law, parameters, state in zip(statics.laws, context.parameters, states):
         function = partial(_gather_chunk, statics, context.nodes, context.bodies, law)
@@ -338,7 +339,7 @@ def _settle(
         return _only_finite(ok, new._replace(cells=held), shape), health
 
 
-def _between_walls(statics: StepStatics, context: StepContext) -> Float[Array, "3 2"]:
+def between_walls(statics: StepStatics, context: StepContext) -> Float[Array, "3 2"]:
     """Lowest and highest cells of particles whose kernel touches no node of the domain's walls."""
     reach = len(statics.kernel.offsets) / 2
     ends = jnp.stack([WALL - 1 + reach - context.low, context.domain - WALL - reach - context.low], 1)

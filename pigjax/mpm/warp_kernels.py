@@ -28,7 +28,7 @@ class TransferKernels(NamedTuple):
 
 
 # By flat index in words of 16 bytes, to which Warp's own vectors are not aligned.
-_ADD = """
+ADD = """
 #if defined(__CUDA_ARCH__)
     SCALAR* at = (SCALAR*)(&grid.data[node]);
 #if FLOAT && __CUDA_ARCH__ >= 900
@@ -40,7 +40,7 @@ _ADD = """
     grid.data[node] = grid.data[node] + value;
 #endif
 """
-_READ = """
+READ = """
 #if defined(__CUDA_ARCH__) && FLOAT
     float4 four = *(const float4*)(&grid.data[node]);
     return wp::vec_t<4, float>(four.x, four.y, four.z, four.w);
@@ -49,7 +49,7 @@ _READ = """
 #endif
 """
 
-_LOAD = _READ.replace("grid.", "rows.").replace("node", "at")
+_LOAD = READ.replace("grid.", "rows.").replace("node", "at")
 _STORE = """
 #if defined(__CUDA_ARCH__) && FLOAT
     *(float4*)(&rows.data[at]) = make_float4(value[0], value[1], value[2], value[3]);
@@ -60,39 +60,18 @@ _STORE = """
 
 
 @functools.cache
-@no_type_check  # Warp reads the annotations and the text of kernels
-def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels:
-    """Kernels for a B-spline with windows of `nodes` a side, in single or double precision.
+@no_type_check
+def spline_functions(nodes: int, nearest: bool, single: bool) -> tuple[Any, Any, Any]:
+    """Functions of Warp for a B-spline: weights of the distance to the node at offset 0, their slopes, and that node.
 
     Args:
-        nodes: 3 quadratic, 4 cubic.
-        nearest: whether offset 0 is the nearest node, else the node below.
+        nodes: as of `transfer_kernels`.
+        nearest: as of `transfer_kernels`.
         single: float32, else float64.
     """
     wp = import_warp()
     real = wp.float32 if single else wp.float64
-    vec3, vec4, weights_of = (wp.types.vector(length=k, dtype=real) for k in (3, 4, nodes))
-    first_offset = -1
-    real_name = "float" if single else "double"
-
-    def text(snippet):
-        return snippet.replace("SCALAR", real_name).replace("FLOAT", str(int(single)))
-
-    # unrolled loops take seconds to compile; a CPU gains little from them
-    unrolled = {"max_unroll": 1 if jax.default_backend() == "cpu" else 16}
-    kernel = functools.partial(wp.kernel, module="unique", enable_backward=False, module_options=unrolled)
-
-    @wp.func_native(text(_ADD))
-    def add(grid: wp.array4d(dtype=vec4), node: int, value: vec4): ...
-
-    @wp.func_native(text(_READ))
-    def read(grid: wp.array4d(dtype=vec4), node: int) -> vec4: ...
-
-    @wp.func_native(text(_LOAD))
-    def load(rows: wp.array2d(dtype=vec4), at: int) -> vec4: ...
-
-    @wp.func_native(text(_STORE))
-    def store(rows: wp.array2d(dtype=vec4), at: int, value: vec4): ...
+    weights_of, first_offset = wp.types.vector(length=nodes, dtype=real), -1
 
     if nodes == 3:
 
@@ -130,6 +109,46 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
         high = size - wp.static(nodes + first_offset)
         held = wp.clamp(at, real(wp.static(-first_offset)), real(high))
         return wp.clamp(int(held), wp.static(-first_offset), high)
+
+    return weights, slopes, anchor
+
+
+@functools.cache
+@no_type_check  # Warp reads the annotations and the text of kernels
+def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels:
+    """Kernels for a B-spline with windows of `nodes` a side, in single or double precision.
+
+    Args:
+        nodes: 3 quadratic, 4 cubic.
+        nearest: whether offset 0 is the nearest node, else the node below.
+        single: float32, else float64.
+    """
+    wp = import_warp()
+    real = wp.float32 if single else wp.float64
+    vec3, vec4 = (wp.types.vector(length=k, dtype=real) for k in (3, 4))
+    first_offset = -1
+    real_name = "float" if single else "double"
+
+    def text(snippet):
+        return snippet.replace("SCALAR", real_name).replace("FLOAT", str(int(single)))
+
+    # unrolled loops take seconds to compile; a CPU gains little from them
+    unrolled = {"max_unroll": 1 if jax.default_backend() == "cpu" else 16}
+    kernel = functools.partial(wp.kernel, module="unique", enable_backward=False, module_options=unrolled)
+
+    @wp.func_native(text(ADD))
+    def add(grid: wp.array4d(dtype=vec4), node: int, value: vec4): ...
+
+    @wp.func_native(text(READ))
+    def read(grid: wp.array4d(dtype=vec4), node: int) -> vec4: ...
+
+    @wp.func_native(text(_LOAD))
+    def load(rows: wp.array2d(dtype=vec4), at: int) -> vec4: ...
+
+    @wp.func_native(text(_STORE))
+    def store(rows: wp.array2d(dtype=vec4), at: int, value: vec4): ...
+
+    weights, slopes, anchor = spline_functions(nodes, nearest, single)
 
     @wp.func
     def first_node(grid: wp.array4d(dtype=vec4), b: int, x: int, y: int, z: int):

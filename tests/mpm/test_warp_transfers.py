@@ -144,7 +144,8 @@ def simulated(backend, laws, *, frames=2, floor=True, contact=None, gradient=Fal
             jnp.asarray(x), velocity=v, volume=1e-4, table=table, material=np.arange(len(x)) % len(laws),
             body=np.arange(len(x)) % 2,
         )  # fmt: skip
-        settings = SimConfig(**{"substeps": 2, "devices": 1, "walls": "slip", "backend": backend} | config)
+        common = {"substeps": 2, "devices": 1, "walls": "slip", "backend": backend, "whole_frames": False}
+        settings = SimConfig(**common | config)
         end, _, health = rollout(
             particles, GRID, table, settings, frames=frames, frame_dt=2e-3, gravity=(0.0, 0.0, -9.8),
             colliders=(plane,) * floor, contact=contact,

@@ -25,9 +25,9 @@ from pigjax.mpm.materials.tensors import (
     transpose,
 )
 
-_NEWTON_STEPS = 10  # from above; down to the limit below, nine leave 4e-10 and ten 4e-15
-_ILL_CONDITIONED = 0.05  # of (s₁+s₂)(s₂+s₃)(s₃+s₁) / (s₁+s₂+s₃)³, 0.3 at rest; below it float32 loses more than 1e-4
-_SMALLEST_STRETCH = 0.01  # floor of J and of principal stretches under a logarithm: stiff, and finite when inverted
+NEWTON_STEPS = 10  # from above; down to the limit below, nine leave 4e-10 and ten 4e-15
+ILL_CONDITIONED = 0.05  # of (s₁+s₂)(s₂+s₃)(s₃+s₁) / (s₁+s₂+s₃)³, 0.3 at rest; below it float32 loses more than 1e-4
+SMALLEST_STRETCH = 0.01  # floor of J and of principal stretches under a logarithm: stiff, and finite when inverted
 
 
 def fixed_corotated(F: Tensors, m: Parameters) -> Tensors:
@@ -46,7 +46,7 @@ def neo_hookean(F: Tensors, m: Parameters) -> Tensors:
     Ψ = μ/2 (tr FᵀF − 3) − μ log J + λ/2 log² J.
     """
     J = determinant(F)
-    barrier = m.lam * jnp.log(jnp.maximum(J, _SMALLEST_STRETCH)) - m.mu
+    barrier = m.lam * jnp.log(jnp.maximum(J, SMALLEST_STRETCH)) - m.mu
     return m.mu * product(F, transpose(F)) + barrier * _orientation(J) * identity(F)
 
 
@@ -66,12 +66,12 @@ def _orientation(measure: Scalars) -> Scalars:
     Inverted matter then pulls itself together. With the pressure of the law it would push its surroundings apart
     without end, since F only grows and shrinks by factors and cannot turn back.
     """
-    return jnp.where(measure > 0, 1.0, jnp.maximum(measure / _SMALLEST_STRETCH, -1.0))
+    return jnp.where(measure > 0, 1.0, jnp.maximum(measure / SMALLEST_STRETCH, -1.0))
 
 
 def hencky_strain(stretches: Float[Array, "3 *n"]) -> Float[Array, "3 *n"]:
     """Logarithms of principal stretches [3 *n], floored at 0.01."""
-    return jnp.log(jnp.maximum(stretches, _SMALLEST_STRETCH))
+    return jnp.log(jnp.maximum(stretches, SMALLEST_STRETCH))
 
 
 def hencky_stress(strain: Float[Array, "3 *n"], m: Parameters) -> Float[Array, "3 *n"]:
@@ -88,7 +88,7 @@ def left_stretch(F: Tensors, b: Tensors, J: Scalars) -> Tensors:
     first = _first_invariant(b, J)
     second = (first * first - trace(b)) / 2
     determinant_of_sums = first * second - J
-    ill = (determinant_of_sums < _ILL_CONDITIONED * first**3) | (determinant_of_sums == 0)  # the latter at F = 0
+    ill = (determinant_of_sums < ILL_CONDITIONED * first**3) | (determinant_of_sums == 0)  # the latter at F = 0
 
     def closed_form():
         numerator = first * J * identity(b) + (first * first - second) * b - product(b, b)
@@ -119,7 +119,7 @@ def _first_invariant(b: Tensors, J: Scalars) -> Scalars:
     fixed = jax.tree.map(lax.stop_gradient, coefficients)
 
     def half_of_them(_, y):
-        for _ in range((_NEWTON_STEPS - 2) // 2):
+        for _ in range((NEWTON_STEPS - 2) // 2):
             y = newton(y, *fixed)
         return y
 
