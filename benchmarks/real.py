@@ -1,5 +1,6 @@
 """Real captures: reconstruction of a folder of posed photos, and objects from their masks."""
 
+import dataclasses
 import time
 from pathlib import Path
 
@@ -23,75 +24,119 @@ from pigjax import (
     render,
     save_ply,
 )
+from pigjax.reconstruction.train import for_capture
 
 COLUMNS = (
-    "capture", "photos", "size [px]", "splats", "steps", "PSNR [dB]", "least", "gains fitted", "training", "SSIM", "s",
-    "CPU s", "GB", "mask IoU",
+    "capture", "settings", "photos", "size [px]", "splats", "steps", "PSNR [dB]", "least", "gains fitted", "training",
+    "SSIM", "s", "CPU s", "GB", "mask IoU",
 )  # fmt: skip
+# settings of `FitConfig` beside its defaults; each is compared with none
+SWITCHES = {
+    "none": {},
+    "exposure": {"exposure_rate": 5e-3},
+    "no-shell": {"shell": 0.0},
+    "shell": {"shell": 0.1},
+    "sizes": {"halvings": 2},
+    "antialias": {"render": {"antialias": True}},
+    "poses": {"pose_rate": 5e-4},
+    "no-bands": {"sh_degree": 0},
+    "three-bands": {"sh_degree": 3},
+    "regularizers": {"opacity_regularizer": 0.01, "scale_regularizer": 0.01},
+    "growth": {"start_splats": 0.25, "grow_every": 0.2},  # shares of the splats and of the steps
+    "error-growth": {"start_splats": 0.25, "grow_every": 0.2, "error_views": 8},
+}
 _CAMERAS = ("transforms.json", "transforms_train.json", "cameras.json", "sparse")  # one of them makes a capture
 _MOST_SCORED = 12  # training photos whose score is averaged
+_LEGEND = (
+    "PSNR and SSIM are means over the held-out photos, every eighth; least: the worst of them; gains fitted: mean PSNR"
+    " once red, green and blue of each held-out photo are scaled to it (gsplat's cc_psnr); training: PSNR of photos"
+    " that were fitted, with their own gains and cameras. Mask IoU: every third masked view, whose mask did not vote,"
+    " against the objects that the other masks gave. Seconds include compilation."
+)
 
 
 def captures(options) -> None:
     """Reconstruct every capture of the folder, each in a process of its own, as `pigjax reconstruct` does."""
+    _print(options, ["none"])
+
+
+def switches(options) -> None:
+    """The same with one setting changed at a time."""
+    _print(options, options.switch or list(SWITCHES))
+
+
+def _print(options, changed: list[str]) -> None:
     if options.data is None:
         print("skipped: --data names no folder of captures")
         return
     folders = [path for path in options.data.iterdir() if any((path / file).exists() for file in _CAMERAS)]
     names = options.sets or sorted(path.name for path in folders)
-    print(head(*COLUMNS))
+    print(head(*COLUMNS), flush=True)
     for name in names:
-        folder = options.data / name
-        out = "" if options.out is None else options.out / f"{name}.ply"
-        said, _ = start_worker("real", folder.resolve(), options.size, options.steps, out).communicate()
-        lines = said.strip().splitlines()
-        print(lines[-1] if lines and lines[-1].startswith("|") else row(name, "failed", *[""] * (len(COLUMNS) - 2)))
-    print(
-        "\nPSNR and SSIM are means over the held-out photos, every eighth; least: the worst of them; gains fitted: mean"
-        " PSNR once red, green and blue of each held-out photo are scaled to it (gsplat's cc_psnr); training: PSNR of"
-        " photos that were fitted. Mask IoU: every third masked view, whose mask did not vote, against the objects that"
-        " the other masks gave. Seconds include compilation."
-    )
+        for switch in changed:
+            out = "" if options.out is None else (options.out / f"{name}-{switch}.ply").resolve()
+            folder = (options.data / name).resolve()
+            given = (options.size, options.steps, options.splats or "", switch, out)
+            said, _ = start_worker("real", folder, *given).communicate()
+            lines = said.strip().splitlines()
+            done = bool(lines) and lines[-1].startswith("|")
+            print(lines[-1] if done else row(name, switch, "failed", *[""] * (len(COLUMNS) - 3)), flush=True)
+    print(f"\n{_LEGEND}")
 
 
-def worker(folder: str, size: str, steps: str, out: str) -> None:
+def worker(folder: str, size: str, steps: str, splats: str, switch: str, out: str) -> None:
     """Reconstruct one capture, and print its line of the table."""
     use_host_devices(None)
     path = Path(folder)
-    views = load_views(path, masks=(path / "object_mask").is_dir() or None, missing_masks="abstain", max_size=int(size))
-    config = FitConfig(steps=int(steps), render=RenderConfig(bands=jax.local_device_count()))
+    masks = (path / "object_mask").is_dir() or None
+    views = load_views(path, masks=masks, missing_masks="abstain", max_size=int(size))
     points = load_points(views.points_path) if views.points_path else None
+    config = _config(int(steps), int(splats) if splats else None, switch, views, None if points is None else points[0])
     begun, worked = time.perf_counter(), time.process_time()
     result = reconstruct(views, config, points=points)
     begun, worked = time.perf_counter() - begun, time.process_time() - worked
     if out:
         save_ply(Path(out), result.gaussians)
-    least = f"{min(result.psnr.values()):.1f}" if result.psnr else ""
-    corrected = f"{np.mean(list(result.corrected_psnr.values())):.2f}" if result.corrected_psnr else ""
+    least = f"{min(result.psnr.values()):.2f}" if result.psnr else ""
+    gained = f"{np.mean(list(result.corrected_psnr.values())):.2f}" if result.corrected_psnr else ""
     cells = [
-        path.name, len(views), f"{views.cameras.width}x{views.cameras.height}", len(result.gaussians), steps,
-        f"{result.mean_psnr:.2f}", least, corrected, f"{_training_psnr(result, views.training):.2f}",
+        path.name, switch, len(views), f"{views.cameras.width}x{views.cameras.height}", len(result.gaussians), steps,
+        f"{result.mean_psnr:.2f}", least, gained, f"{_training_psnr(result, views.training, config):.2f}",
         f"{result.mean_ssim:.4f}", f"{begun:.0f}", f"{worked:.0f}", f"{peak_memory():.1f}",
-        _mask_iou(result.gaussians, views),
+        _mask_iou(result.gaussians, views, config.render),
     ]  # fmt: skip
     print(row(*cells))
 
 
-def _training_psnr(result, train: Views) -> float:
+def _config(steps: int, splats: int | None, switch: str, views: Views, points=None) -> FitConfig:
+    """Settings of a run; growth is given in shares."""
+    changes = dict(SWITCHES[switch])
+    drawing = RenderConfig(bands=jax.local_device_count(), **changes.pop("render", {}))
+    config = for_capture(FitConfig(steps=steps, splats=splats, render=drawing), views.training.cameras, points)
+    if "start_splats" in changes:
+        changes["start_splats"] = max(int(changes["start_splats"] * config.splats), 4)
+        changes["grow_every"] = max(int(changes["grow_every"] * steps), 1)
+    return dataclasses.replace(config, **changes)
+
+
+def _training_psnr(result, train: Views, config: FitConfig) -> float:
     """Mean over some training photos, with their cameras and exposures as they were fitted [dB]."""
     scores = []
     for k in np.unique(np.linspace(0, len(train) - 1, _MOST_SCORED).astype(int)):
-        rgb = render(result.gaussians, result.cameras[k]).rgb * (1.0 if result.gains is None else result.gains[k])
+        rgb = render(result.gaussians, result.cameras[k], config.render).rgb
+        rgb = rgb if result.gains is None else rgb * result.gains[k]
         valid = None if train.valid is None else jnp.asarray(train.valid[k])
         scores.append(float(psnr(jnp.clip(rgb, 0, 1), jnp.asarray(train.images[k]), valid=valid)))
     return float(np.mean(scores))
 
 
-def _mask_iou(gaussians, views: Views) -> str:
+def _mask_iou(gaussians, views: Views, drawing: RenderConfig) -> str:
     """Mean IoU over the objects of masks that did not vote; "" where there are fewer than three."""
-    masks = None if views.masks is None else np.asarray(views.masks)
-    known = [] if masks is None else np.flatnonzero(masks[:, 0, 0] >= 0)
-    if masks is None or len(known) < 3:
+    if views.masks is None:
+        return ""
+    masks = np.asarray(views.masks)
+    known = np.flatnonzero(masks[:, 0, 0] >= 0)
+    if len(known) < 3:
         return ""
     tested = known[1::3]
     voting = np.setdiff1d(known, tested)
@@ -100,18 +145,21 @@ def _mask_iou(gaussians, views: Views) -> str:
     membership = jnp.eye(count)[jnp.maximum(labels.object_id, 0)]
     scores = []
     for k in tested:
-        frame = render(gaussians, views.cameras[int(k)], outputs=("object_weights",), object_weights=membership)
+        asked = {"outputs": ("object_weights",), "object_weights": membership}
+        frame = render(gaussians, views.cameras[int(k)], drawing, **asked)
         found = np.asarray(jnp.argmax(frame.object_weights, -1))
         scores += [float(mean_iou(found == i, masks[k] == i)) for i in range(1, count) if (masks[k] == i).any()]
     return f"{np.mean(scores):.3f}"
 
 
-PARTS = {"captures": ("Captures", captures)}
+PARTS = {"captures": ("Captures", captures), "switches": ("Settings", switches)}
 OPTIONS = {
     "data": {"type": Path, "help": "folder with a folder for each capture"},
     "sets": {"nargs": "*", "help": "names of captures; all without"},
     "size": {"type": int, "default": 256, "help": "longest side of the photos [px]"},
     "steps": {"type": int, "default": 3000, "help": "of training"},
+    "splats": {"type": int, "help": "number of Gaussians; from the photos without"},
+    "switch": {"nargs": "*", "choices": list(SWITCHES), "help": "settings to compare; all without"},
     "out": {"type": Path, "help": "folder for the Gaussians (.ply)"},
 }
 DEVICES = None

@@ -151,7 +151,7 @@ SIGNS = {
     "drucker_prager": (lambda: traced([material("drucker_prager")]), lambda p: primitives(p)["tan"] > 0),
     "von_mises": (lambda: traced([material("von_mises")]), lambda p: primitives(p)["exp"] > 0),
     "foam": (lambda: traced([material("foam")]), lambda p: primitives(p)["pow"] > 0),
-    "rigid bodies": (lambda: traced([Material("rigid", density=1e3)]), lambda p: primitives(p)["sin"] > 0),
+    "rigid bodies": (lambda: traced([Material("rigid", density=1e3)]), lambda p: primitives(p)["scatter-max"] > 0),
     "gusts": (lambda: traced(forces=(Wind((1.0, 0, 0), 1.0, gusts=1.0),)), lambda p: primitives(p)["cos"] > 0),
 }
 

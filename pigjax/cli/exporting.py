@@ -39,13 +39,14 @@ def export(
     """Write a run as files for other tools: splats, particles, surfaces, pictures with alpha."""
     one_device_per_core()
     from pigjax.scene import load_scene
-    from pigjax.scene.export import FORMATS, export_run
+    from pigjax.scene.export import FORMATS, check_format, export_run
     from pigjax.scene.replay import load_run
 
     formats = [name.strip() for name in to.split(",")]
     for name in formats:
         if name not in FORMATS:
             raise InputError(f"--to {name}: choose one of {', '.join(FORMATS)}.")
+        check_format(name)  # of all before the first is written, which may take minutes
     loaded = load_run(run, scene=None if scene is None else load_scene(scene))
     chosen = None if frames is None else _frames(frames, loaded.frames)
     folder = run / "export" if out is None else out

@@ -66,7 +66,10 @@ def reconstruct(
     only: Annotated[int | None, typer.Option(help="Fit only what the masks give this id.")] = None,
     random_background: Annotated[bool, typer.Option(help="A new colour each step behind what masks cover.")] = False,
     exposure: Annotated[bool, typer.Option(help="Fit gains of red, green and blue to each photo.")] = False,
-    shell: Annotated[float, typer.Option(help="Share of Gaussians on a far sphere, for sky.", min=0, max=0.99)] = 0.0,
+    shell: Annotated[
+        float | None,
+        typer.Option(help="Share of Gaussians on a far sphere; for unbounded scenes 0.1.", min=0, max=0.99),
+    ] = None,
     halvings: Annotated[int, typer.Option(help="Begin with photos halved this often.", min=0, max=8)] = 0,
     error_views: Annotated[
         int, typer.Option(help="Photos whose errors draw Gaussians before a relocation; 0: by opacity.", min=0)
@@ -89,7 +92,7 @@ def reconstruct(
     from pigjax import io
     from pigjax.reconstruction.reconstruct import FitConfig, provenance, reconstruct
     from pigjax.reconstruction.reconstruct import Progress as Step
-    from pigjax.reconstruction.train import splat_budget
+    from pigjax.reconstruction.train import for_capture, splat_budget
     from pigjax.splat import RenderConfig
 
     needs_masks = only is not None or random_background
@@ -103,7 +106,7 @@ def reconstruct(
         origin=origin,
     )
     points = io.load_points(loaded.points_path, origin=origin) if loaded.points_path else None
-    train = loaded.training.cameras
+    train = (loaded.masked if needs_masks else loaded).training.cameras
     splats = splat_budget(len(train), train.width, train.height) if splats is None else splats
     doublings = max(math.ceil(math.log2(splats / start_splats)), 1) if start_splats else 1
     config = FitConfig(
@@ -124,6 +127,7 @@ def reconstruct(
         seed=seed,
         render=RenderConfig(bands=jax.local_device_count(), antialias=antialias),
     )
+    config = for_capture(config, train, None if points is None else points[0])
     if out is None:
         out = Path(f"reconstruction-{_name_of(views)}")
     out = io.output_folder(out, files=("gaussians.ply", "poses.json", "report.json"), folders=("previews",))
@@ -152,7 +156,7 @@ def reconstruct(
         poses = dict(zip(result.trained_on, result.cameras.world_to_cam.tolist()))
         io.write_json(out / "poses.json", {"world_to_cam": poses})
     io.write_json(out / "report.json", {"psnr": result.psnr, "ssim": result.ssim, "mean_psnr": result.mean_psnr,
-                                        "corrected_psnr": result.corrected_psnr,
+                                        "corrected_psnr": result.corrected_psnr, "relocated": result.relocated,
                                         "history": [step._asdict() for step in result.history]})  # fmt: skip
     table = Table("held-out view", "PSNR dB", "SSIM")
     for name in result.psnr:
@@ -165,6 +169,7 @@ def _plan(views: Any, config: Any, points: Any) -> str:
     """What a reconstruction will do, in a line."""
     held_out, camera = views.held_out, views.cameras
     start = "random points" if points is None else f"{len(points[0]):,} sparse points"
+    start += f" and a far shell of {int(config.shell * config.splats):,}" if config.shell else ""
     return (
         f"{len(views.training)} photos of {camera.width}x{camera.height} px, {len(held_out or ())} held out;"
         f" {config.splats:,} Gaussians of SH degree {config.sh_degree} from {start}; {config.steps:,} steps"

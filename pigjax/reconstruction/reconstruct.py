@@ -33,6 +33,7 @@ from pigjax.reconstruction.train import (
     Photos,
     corrected_cameras,
     count_at,
+    for_capture,
     grow,
     halved,
     halvings_at,
@@ -42,7 +43,6 @@ from pigjax.reconstruction.train import (
     start_per_view,
     train_steps,
     view_optimizer_of,
-    with_budget,
 )
 from pigjax.splat import Gaussians, render
 from pigjax.splatting.binning import shards_of
@@ -120,15 +120,20 @@ def reconstruct(
 
     Raises:
         StaleError: the checkpoint was made from other photos, cameras, masks, points or settings; it names which.
-        InputError: no training views, too few points, no masks where the settings need them, or a far shell where
-            masks leave the background out.
+        InputError: no training views, too few points, a photo that is not finite, no masks where the settings need
+            them, or a far shell where masks leave the background out.
     """
+    for name, photo in zip(views.names, views.images):
+        if not np.isfinite(photo).all():
+            raise InputError(
+                f"photo {name!r} holds NaN or infinity; give finite values in 0..1, or leave the view out."
+            )
     # with a capacity, splats would be dropped silently
     config = replace(config, render=replace(config.render, capacity=None, differentiation="reverse"))
     if (config.object_id is not None or config.random_background) and views.masks is not None:
         views = views.masked  # a view without a mask says nothing of where the object is
     train, held_out = views.training, views.held_out
-    config = with_budget(config, train.cameras)
+    config = for_capture(config, train.cameras, None if points is None else points[0])
     assert config.splats is not None
     if config.shell and (config.object_id is not None or config.random_background):
         raise InputError(f"FitConfig.shell = {config.shell}: masks leave the background out; leave it 0 with them.")
@@ -194,7 +199,7 @@ def reconstruct(
 
 def _start(points: Cloud, train: io.Views, count: int, config: FitConfig) -> Gaussians:
     """Gaussians on the sparse points, and a share of them on a far shell where that is asked for."""
-    on_shell = int(config.shell * count)
+    on_shell = int((config.shell or 0.0) * count)
     on_shell = on_shell if on_shell >= _LEAST_SHELL else 0
     near = start_gaussians(points[0], points[1], count - on_shell, config.sh_degree, seed=config.seed)
     if not on_shell:

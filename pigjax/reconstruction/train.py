@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.arrays import static_field
-from pigjax.core.camera import Camera
+from pigjax.core.camera import Camera, focus_of
 from pigjax.core.checks import LARGEST_WHOLE, Limits, check_fields, shown
 from pigjax.core.errors import InputError
 from pigjax.core.metrics import ssim
@@ -25,6 +25,8 @@ from pigjax.splat import Gaussians, RenderConfig, backproject, render
 
 _PIXELS_A_SPLAT = 140
 _BUDGET = (1000, 1_000_000)
+_SHELL = 0.1  # share of the splats
+_BACKGROUND = 0.1  # share of the sparse points
 
 
 class FitConfig(eqx.Module):
@@ -55,8 +57,9 @@ class FitConfig(eqx.Module):
     pose_rate: float = static_field(default=0.0, limits=Limits(0, 1e3))
     # of the logarithms of the gains of red, green and blue in each photo (`exposure`); 0 traces none
     exposure_rate: float = static_field(default=0.0, limits=Limits(0, 1e3))
-    # of the splats on a sphere around the scene, for sky and background (`init.far_shell`); 0 makes none
-    shell: float = static_field(default=0.0, limits=Limits(0, 1, below=True))
+    # share of the splats that start on a sphere around the scene, for sky and background (`init.far_shell`). None: a
+    # tenth where more than a tenth of the sparse points lie farther out than all cameras, else none
+    shell: float | None = static_field(default=None, limits=Limits(0, 1, below=True))
     # the photos are halved this often at the start, and doubled after equal parts of the steps up to `full_size_from`
     halvings: int = static_field(default=0, limits=Limits(0, 8))
     full_size_from: float = static_field(default=0.3, limits=Limits(0, 1))  # share of the steps
@@ -137,15 +140,35 @@ def splat_budget(views: int, width: int, height: int) -> int:
     return int(np.clip(views * width * height // _PIXELS_A_SPLAT, *_BUDGET))
 
 
-def with_budget(config: FitConfig, cameras: Camera) -> FitConfig:
-    """Settings whose number of splats is a number: that of the settings, or the budget for these training views."""
-    if config.splats is not None:
-        return config
-    return replace(config, splats=splat_budget(len(cameras), cameras.width, cameras.height))
+def for_capture(config: FitConfig, cameras: Camera, points: Float[np.ndarray, "n 3"] | None) -> FitConfig:
+    """Settings with what is None taken from a capture: the number of splats, and the share on a far shell. Host.
+
+    Args:
+        config: settings.
+        cameras: training views.
+        points: sparse points [m]; None: there are none, and no shell is made.
+    """
+    splats, shell = config.splats, config.shell
+    if splats is None:
+        splats = splat_budget(len(cameras), cameras.width, cameras.height)
+    if shell is None:
+        masked = config.object_id is not None or config.random_background
+        shell = _SHELL if not masked and points is not None and is_unbounded(cameras, points) else 0.0
+    return replace(config, splats=splats, shell=shell)
+
+
+def is_unbounded(cameras: Camera, points: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether a scene has a background: more than a tenth of its points lie farther out than all cameras. Host.
+
+    Distances are from the point that the cameras look at.
+    """
+    centre = focus_of(cameras)
+    reach = np.linalg.norm(np.asarray(cameras.position) - centre, axis=1).max()
+    return float(np.mean(np.linalg.norm(points - centre, axis=1) > reach)) > _BACKGROUND
 
 
 def count_at(step: int, config: FitConfig) -> int:
-    """Number of splats from this step on; `config.splats` must be given (`with_budget`)."""
+    """Number of splats from this step on; `config.splats` must be given (`for_capture`)."""
     assert config.splats is not None
     first = config.splats if config.start_splats is None else min(config.start_splats, config.splats)
     return min(config.splats, first * 2 ** min(step // config.grow_every, 40))

@@ -130,7 +130,8 @@ def draft_scene(
     for part in parts:
         part.low, part.high = part.low - middle, part.high - middle
     sources = _Sources(gaussians_path, views_path, masks_path, names_path, folder)
-    text = _text(sources, parts, labels is not None, given, origin, ground is not None, extent.radius, remarks)
+    heights = np.asarray(here.means, np.float64)[_tallest(parts).members, 2] - middle[2]
+    text = _text(sources, parts, labels is not None, given, origin, ground is not None, extent.radius, remarks, heights)
     return Draft(
         text=text,
         parts=parts,
@@ -368,12 +369,12 @@ def _text(
     is_ground: bool,
     radius: float,
     remarks: list[str],
+    heights: Float[np.ndarray, "n"],
 ) -> str:
-    moving = [part for part in parts if not part.fixed]
-    dx = _rounded(min(part.size for part in moving) / _CELLS)
-    tallest = max(moving, key=lambda part: part.high[2] - part.low[2])
+    dx = _rounded(min(part.size for part in parts if not part.fixed) / _CELLS)
+    tallest = _tallest(parts)
     tall = float(tallest.high[2] - tallest.low[2])
-    held = float(tallest.low[2]) + 0.15 * tall
+    held, why = _foot(heights, float(tallest.low[2]), tall)
     name = _name_of(up)
     direction = _quoted(name) if name in AXES else f"[{name}]"
     middle = ", ".join(f"{value + 0.0:.6g}" for value in origin)
@@ -409,8 +410,8 @@ def _text(
         "normal = [0, 0, 1]",
         "friction = 0.5 # Coulomb's coefficient",
         "",
-        "# [pinned.foot] # matter behind this plane does not move, as a plant in its pot",
-        f"# point = [0, 0, {held:.4g}] # m",
+        "# [pinned.foot] # matter below this plane does not move, as a plant's pot",
+        f"# point = [0, 0, {held:.4g}] # m; {why}",
         "# normal = [0, 0, 1]",
         "",
         "# [forces.breeze] # beside gravity: kind = wind, field, impulse or spring",
@@ -431,6 +432,19 @@ def _text(
         "",
     ]
     return "\n".join(lines)
+
+
+def _tallest(parts: list[Part]) -> Part:
+    """Of the parts that move."""
+    return max((part for part in parts if not part.fixed), key=lambda part: part.high[2] - part.low[2])
+
+
+def _foot(heights: Float[np.ndarray, "n"], low: float, tall: float) -> tuple[float, str]:
+    """Height below which a thing would be held [m], and what tells it: a flat layer in its lower third, as soil has."""
+    share, _, top = _ground_layer(heights)
+    if share >= _LEAST_GROUND and top > low + 0.05 * tall:  # lower ones are the thing's own bottom
+        return top, f"top of a flat layer with {100 * share:.0f} % of its splats, as soil in a pot"
+    return low + 0.15 * tall, "a guess: 15 % of its height"
 
 
 def _object_lines(part: Part, *, needs_id: bool) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -125,8 +126,7 @@ def export_run(
         MissingFileError: the folder holds no run.
         InputError: an unknown format, frame or object, a package is missing, or a file cannot be written.
     """
-    if to not in _EXPORTS:
-        raise InputError(f"export: to = {to!r}: {suggest(to, _EXPORTS)}.")
+    check_format(to)
     if mesh not in ("glb", "obj"):
         raise InputError(f"export: mesh = {mesh!r}: {suggest(mesh, ('glb', 'obj'))}.")
     run = run if isinstance(run, Run) else load_run(run)
@@ -340,3 +340,25 @@ _EXPORTS: dict[str, Callable[[_Job], list[Path]]] = {
     "gif": partial(_film, suffix="gif"),
 }
 FORMATS = tuple(_EXPORTS)
+# package of a format as it is imported, as it is installed, and the extra that brings it
+_NEEDS = {
+    "usd": ("pxr", "usd-core", "usd"),
+    "html": ("viser", "viser", "view"),
+    "vtk": ("meshio", "meshio", "meshes"),
+    "surface": ("skimage", "scikit-image", "meshes"),
+    "colliders": ("skimage", "scikit-image", "meshes"),
+}
+
+
+def check_format(to: str) -> None:
+    """Refuse a format that is unknown, or whose package is missing. Host.
+
+    Raises:
+        InputError: so it is.
+    """
+    if to not in _EXPORTS:
+        raise InputError(f"export: to = {to!r}: {suggest(to, _EXPORTS)}.")
+    if to in _NEEDS:
+        module, package, extra = _NEEDS[to]
+        if importlib.util.find_spec(module) is None:
+            raise InputError(f"export: {to} needs {package}: pip install 'pigjax[{extra}]'; nothing was written.")

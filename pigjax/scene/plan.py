@@ -43,7 +43,8 @@ from pigjax.segmentation import Labels, fill_unseen
 from pigjax.splat import Gaussians, RenderConfig
 from pigjax.splatting.types import extent_of
 
-_FRAMED = 0.98  # share of the moving matter that the default orbit frames
+_FRAMED = 0.999  # share of the moving matter that the default orbit frames: the tip of a leaf is less than a hundredth
+_ROOM = 1.1  # times that distance, for what sways
 
 
 @dataclass
@@ -445,7 +446,7 @@ def make_cameras(
     radius = spec.radius if spec.radius is not None else _default_radius(inputs.gaussians, target)
     if spec.radius is None and matter is not None:  # from so far that all of the moving objects fits in
         fits = np.quantile(np.linalg.norm(matter - target, axis=1), _FRAMED)
-        radius = max(radius, float(fits) / np.sin(np.arctan(min(width, height) / (2 * focal))))
+        radius = max(radius, _ROOM * float(fits) / np.sin(np.arctan(min(width, height) / (2 * focal))))
     return orbit(
         target,
         radius=radius,

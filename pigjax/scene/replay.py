@@ -189,8 +189,11 @@ class Run:
     @cached_property
     def cameras(self) -> Camera:
         """Batch of the video's cameras, one for each frame."""
-        inputs = read_inputs(self.scene) if self.scene.camera.view else Inputs(self.gaussians, None, self.ids, {})
-        return make_cameras(self.scene, inputs, np.asarray(self.rest.x).mean(0))
+        spec = self.scene.camera
+        photos = spec.view is not None or (spec.is_open and self.scene.input.views is not None)
+        inputs = read_inputs(self.scene) if photos else Inputs(self.gaussians, None, self.ids, {})
+        matter = np.asarray(self.rest.x)
+        return make_cameras(self.scene, inputs, matter.mean(0), matter)
 
     def colliders(self) -> dict[str, Collider]:
         """Colliders by name: still objects, then those of the scene file.

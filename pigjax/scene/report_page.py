@@ -61,7 +61,8 @@ def report_page(
         parts.append("<h2>Warnings</h2>")
         parts += [f'<p class="note">{escape(text)}</p>' for text in report.warnings]
     parts += ["<h2>Modelled</h2>", _table(_modelled(scene, report))]
-    parts += ["<h2>Left out</h2>", "<ul>", *(f"<li>{escape(text)}</li>" for text in left_out(scene, report)), "</ul>"]
+    without = [*left_out(scene, report), "Elastic energy in the curves below."]
+    parts += ["<h2>Left out</h2>", "<ul>", *(f"<li>{escape(text)}</li>" for text in without), "</ul>"]
     parts += ["<h2>Objects</h2>", _objects(scene, report), "<h2>Times</h2>", _times(report)]
     parts += ["<h2>Health</h2>", _estimated(report), _health(report), _charts(scene, report)]
     parts += ["<h2>Settings</h2>", "<p>Save as a scene file beside this page to reproduce the run.</p>"]
@@ -99,7 +100,6 @@ def left_out(scene: Scene, report: RunReport) -> list[str]:
         )
     if count := report.sizes.get("gaussians_without_particle"):
         found.append(f"Particles of {count} Gaussians, which are carried by their neighbours.")
-    found.append("Elastic energy in the curves below.")
     return found
 
 

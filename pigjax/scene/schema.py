@@ -5,11 +5,9 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
-from math import radians
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-import jax.numpy as jnp
 from msgspec import field, to_builtins
 from msgspec.structs import replace
 
@@ -25,9 +23,9 @@ from pigjax.scene.accuracy import LEVELS, Accuracy, with_level
 from pigjax.scene.colliders import BoxSpec, CapsuleSpec, CylinderSpec, PlaneSpec, SphereSpec
 from pigjax.scene.decode import Section, decode, merged
 from pigjax.scene.forces import AnyForce
+from pigjax.scene.light import LightSpec
 from pigjax.scene.regions import RegionSpec, regions_of
 from pigjax.scene.world import WorldSpec, axis_of, metres_of
-from pigjax.splatting.shadows import Light
 from pigjax.splatting.types import RenderConfig
 
 Triple = tuple[float, float, float]
@@ -174,23 +172,6 @@ class DrawingSpec(Section, frozen=True):
     alpha_min: Annotated[float, Limits(0, RenderConfig.alpha_max, below=True)] = 1 / 255
     # a pixel is closed before it falls below, as in 3DGS
     transmittance_min: Annotated[float, Limits(0, 1, below=True)] = 1e-4
-
-
-class LightSpec(Section, frozen=True):
-    """A distant light in which moving matter casts soft shadows on what stays; see `Light`."""
-
-    direction: Annotated[Triple, _WEIGHT]  # in which the light travels: [0, 0, -1] comes from above
-    softness: Annotated[float, Limits(0, 80, unit="degrees")] = 3.0  # angular radius of the light: 0.27 is the sun's
-    strength: Annotated[float, Limits(0, 1)] = 0.6  # share of the light that a full shadow takes away
-
-    def rules(self) -> Iterable[tuple[str, bool, str]]:
-        """The light goes somewhere."""
-        yield "direction", any(self.direction), "it points nowhere; give the direction in which light travels"
-
-    def to_light(self) -> Light:
-        """The light of these fields: one direction where it is a point, else eight."""
-        softness = radians(self.softness)
-        return Light(jnp.asarray(self.direction), softness, self.strength, samples=8 if softness else 1)
 
 
 class OutputSpec(Section, frozen=True):

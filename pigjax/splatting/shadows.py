@@ -237,7 +237,13 @@ def _terms(places: Float[Array, "*b p 3"], tile: Int[Array, "*b"], config: Blend
     return jnp.stack([jnp.ones_like(x), x, y, x * x, x * y, y * y], -2)
 
 
-def _alphas(rows: Float[Array, "k f"], valid: Bool[Array, "k"], terms, depths, config: BlendConfig):
+def _alphas(
+    rows: Float[Array, "k f"],
+    valid: Bool[Array, "k"],
+    terms: Float[Array, "6 p"],
+    depths: Float[Array, "p"],
+    config: BlendConfig,
+) -> tuple[Float[Array, "k p"], Bool[Array, "k p"]]:
     """Alpha of the splats of a chunk at the centres of a block, 0 where they are not in front of them."""
     unclamped = jnp.exp(jnp.where(valid[:, None], matmul(rows[:, :TERMS], terms), -jnp.inf))
     alpha = jnp.minimum(unclamped, config.alpha_max)
@@ -283,7 +289,9 @@ def _walk_reverse(
     return _walk(table, places, boxes, blocks, config)
 
 
-def _walk_fwd(table, places, boxes, blocks, config):
+def _walk_fwd(
+    table: Float[Array, "n f"], places: Float[Array, "v p 3"], boxes: Boxes, blocks: _Blocks, config: BlendConfig
+) -> tuple[Float[Array, "v p"], Any]:
     reached = _walk(table, places, boxes, blocks, config)
     return reached, (table, places, boxes, blocks, reached)
 

@@ -46,6 +46,8 @@ SCENE = {
     "capsules": {"rod": ROUND},
     "cylinders": {"disc": ROUND},
     "pinned": {"rim": {"centre": [0, 0, 0.3], "radius": 0.1}},
+    "volumes": {"jet": {"material": "water", "lower": [0, 0, 1], "upper": [0.2, 0.2, 1.2], "colour": [0, 0.4, 1]}},
+    "light": {"direction": [0, 0, -1]},
     "forces": {"breeze": {"kind": "wind", "velocity": [1, 0, 0], "drag": 2.0}},
     "world": {},
     "output": {},

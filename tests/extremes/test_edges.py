@@ -29,6 +29,13 @@ def test_pictures_of_scenes_of_any_size_and_of_odd_splats_are_finite():
     assert len(found) == len(names)
 
 
+@pytest.mark.parametrize("value", ["nan", "inf"])
+def test_a_photo_that_is_not_finite_is_refused_before_it_is_fitted(value):
+    (found,) = edges.outcomes_of("reconstruction", [f"photos of the value {value}"]).values()
+    assert found.kind == REFUSED
+    assert found.told.startswith("photo 'a' holds NaN or infinity")
+
+
 def test_outcomes_tell_faults_from_errors_and_numbers():
     def refused():
         raise InputError("x = 1: too small.")

@@ -19,6 +19,7 @@ from pigjax.reconstruction.reconstruct import FitConfig, reconstruct
 from pigjax.reconstruction.train import (
     FitState,
     Photos,
+    for_capture,
     halved,
     halvings_at,
     optimizer_of,
@@ -27,7 +28,6 @@ from pigjax.reconstruction.train import (
     start_per_view,
     train_steps,
     view_optimizer_of,
-    with_budget,
 )
 from pigjax.splat import render
 
@@ -119,8 +119,18 @@ def test_the_budget_follows_the_pixels_of_the_photos():
     assert splat_budget(32, 256, 256) == 14_979
     assert splat_budget(1, 16, 16) == 1000
     assert splat_budget(300, 4000, 3000) == 1_000_000
-    assert with_budget(FitConfig(), CAMERAS).splats == 1000
-    assert with_budget(FitConfig(splats=7), CAMERAS).splats == 7
+    assert for_capture(FitConfig(), CAMERAS, None).splats == 1000
+    assert for_capture(FitConfig(splats=7), CAMERAS, None).splats == 7
+
+
+@pytest.mark.parametrize(("share", "shell"), [(0.0, 0.0), (0.05, 0.0), (0.2, 0.1)])
+def test_only_scenes_with_points_beyond_the_cameras_get_a_shell(share, shell):
+    points = np.random.default_rng(0).normal(0, 0.3, (1000, 3))
+    points[: int(share * 1000)] *= 5.0 / np.linalg.norm(points[: int(share * 1000)], axis=1, keepdims=True)
+    assert for_capture(FitConfig(), CAMERAS, points).shell == shell
+    assert for_capture(FitConfig(shell=0.3), CAMERAS, points).shell == 0.3
+    assert for_capture(FitConfig(object_id=1), CAMERAS, points).shell == 0.0
+    assert for_capture(FitConfig(), CAMERAS, None).shell == 0.0
 
 
 def test_known_exposures_are_recovered_and_held_out_photos_scored_apart_from_theirs():

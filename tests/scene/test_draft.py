@@ -1,5 +1,6 @@
 """`pigjax new`: what it guesses, what it says is missing, and that the scene that it writes loads, plans and runs."""
 
+import re
 import warnings
 from pathlib import Path
 
@@ -14,7 +15,15 @@ from pigjax.cli import app
 from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io.finding import find_parts
 from pigjax.scene import load_scene, run_scene
-from pigjax.scene.draft import Part, _mark_supports, find_direction, ground_height, up_of_ground
+from pigjax.scene.draft import (
+    Part,
+    _foot,
+    _mark_supports,
+    draft_scene,
+    find_direction,
+    ground_height,
+    up_of_ground,
+)
 from pigjax.scene.plan import make_plan, read_inputs, segment
 from pigjax.splat import Gaussians
 
@@ -118,6 +127,26 @@ def test_a_single_thing_is_one_object(tmp_path):
     assert (list(scene.objects), scene.input.labels, scene.world.up) == (["part_1"], None, "y")
     assert scene.world.origin[1] == pytest.approx(-0.3, abs=0.02)
     assert scene.planes["ground"].point[2] == 0
+
+
+def test_a_plant_is_held_at_its_soil(tmp_path):
+    """Soil at 0.25 m in a thin pot; the lines behind # hold it, and blow, once they are uncommented."""
+    rng = np.random.default_rng(3)
+    angle, height = rng.uniform(0, 2 * np.pi, 600), rng.uniform(0, 0.28, 600)
+    pot = np.stack([0.16 * np.cos(angle), 0.16 * np.sin(angle), height], 1)
+    soil = np.concatenate([0.3 * rng.uniform(-0.5, 0.5, (1500, 2)), np.full((1500, 1), 0.25)], 1)
+    leaves = rng.uniform([-0.2, -0.2, 0.25], [0.2, 0.2, 0.9], (2500, 3))
+    io.save_ply(tmp_path / "plant.ply", splats(np.concatenate([pot, soil, leaves])))
+    draft = draft_scene(tmp_path / "plant.ply", tmp_path, up="z")
+    commented = re.sub(
+        r"^# (\[(?:pinned|forces)\..*(?:\n# .*)*)", lambda m: m[1].replace("\n# ", "\n"), draft.text, flags=re.M
+    )
+    (tmp_path / "scene.toml").write_text(commented)
+    scene = load_scene(tmp_path / "scene.toml")
+    assert scene.pinned["foot"].point[2] == pytest.approx(0.26, abs=0.015)  # at most a layer of 1/60 above the soil
+    assert scene.forces["breeze"].velocity == (2, 0, 0)
+    assert "as soil in a pot" in draft.text
+    assert _foot(leaves[:, 2], 0.25, 0.65) == (pytest.approx(0.3475), "a guess: 15 % of its height")
 
 
 def test_what_is_missing_is_said_with_commands(tmp_path):

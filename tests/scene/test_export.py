@@ -17,11 +17,14 @@ from typer.testing import CliRunner
 from pigjax import io
 from pigjax.clamp import ClampParams
 from pigjax.cli import app
+from pigjax.core.camera import project
 from pigjax.core.errors import InputError, MissingFileError
 from pigjax.core.metrics import psnr
 from pigjax.core.placing import placed
 from pigjax.coupling.binding import deform
 from pigjax.scene import export_run, load_run, load_scene, run_scene
+from pigjax.scene.plan import Inputs, make_cameras
+from pigjax.scene.schema import CameraSpec
 from pigjax.splat import RenderConfig, Splats, render
 
 FRAMES = 3
@@ -197,6 +200,27 @@ def test_the_command_writes_formats_frames_and_objects(thrown, tmp_path):
         assert re.search(message, str(failed.exception)), failed.exception
     with pytest.raises(MissingFileError, match=r"holds no scene\.toml"):
         load_run(tmp_path)
+
+
+def test_a_missing_package_is_told_before_anything_is_written(thrown, tmp_path, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "viser" else True)
+    failed = CliRunner().invoke(app, ["export", str(thrown), "--to", "ply,html", "-o", str(tmp_path / "files")])
+    assert str(failed.exception) == "export: html needs viser: pip install 'pigjax[view]'; nothing was written."
+    assert not (tmp_path / "files").exists()
+
+
+def test_pictures_are_taken_by_the_camera_of_the_video(run):
+    """Where the scene file says nothing of it: all of a tall thing is in the picture, with room."""
+    scene = msgspec.structs.replace(run.scene, camera=CameraSpec(width=40, height=40))
+    x = np.random.default_rng(0).uniform([-0.1, -0.1, 0], [0.1, 0.1, 0.3], (2000, 3))
+    x[:20, 2] = np.linspace(0.3, 1.2, 20)  # a thin stem
+    tall = dataclasses.replace(run, scene=scene)
+    tall.__dict__["rest"] = dataclasses.replace(run.rest, x=jnp.asarray(x, jnp.float32))
+    points, depth = project(jnp.asarray(x, jnp.float32), tall.cameras[0])
+    inside = ((np.asarray(points) > 0) & (np.asarray(points) < 40)).all(-1) & (np.asarray(depth) > 0)
+    assert inside.mean() > 0.998
+    drawn = make_cameras(scene, Inputs(run.gaussians, None, run.ids, {}), x.mean(0), x)
+    np.testing.assert_allclose(tall.cameras.world_to_cam, drawn.world_to_cam, atol=1e-5)
 
 
 def test_a_georeferenced_capture_is_exported_where_it_lies(thrown, tmp_path):

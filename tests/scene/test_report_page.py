@@ -107,6 +107,7 @@ def test_names_and_messages_of_files_are_text():
 def test_what_is_left_out_follows_the_scene():
     report = RunReport(modelled={"sh_coefficients": 4}, sizes={"gaussians_without_particle": 7})
     alone = " ".join(left_out(scene_from(values(planes={}, simulation__fill=False)), report))
+    assert "curves below" not in alone, "pigjax plan prints this list, and no curves"
     for told in ("hollow", "Any support", "turn with the matter", "7 Gaussians"):
         assert told in alone
     assert "Contact" not in alone

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -41,19 +39,16 @@ class Parameters(eqx.Module):
     fibre_elevation: Float[Array, "*m"] = _number(default=0.0)  # of fibres at rest, above the plane of x and y [rad]
 
     @property
-    @partial(jax.jit, inline=True)
     def mu(self) -> Float[Array, "*m"]:
         """Shear modulus μ = E / 2(1 + ν) [Pa]."""
         return self.young / (2 * (1 + self.poisson))
 
     @property
-    @partial(jax.jit, inline=True)
     def lam(self) -> Float[Array, "*m"]:
         """Lamé's first parameter λ = E ν / (1 + ν)(1 − 2ν) [Pa]."""
         return self.young * self.poisson / ((1 + self.poisson) * (1 - 2 * self.poisson))
 
     @property
-    @partial(jax.jit, inline=True)
     def bulk(self) -> Float[Array, "*m"]:
         """Bulk modulus [Pa]: as given, or λ + 2μ/3."""
         return jnp.where(self.bulk_modulus > 0, self.bulk_modulus, self.lam + 2 / 3 * self.mu)
