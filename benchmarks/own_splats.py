@@ -2,10 +2,7 @@
 
 `rest`: objects of the bundled tabletop drawn by splats as fine as their particles, in views not used for their fit.
 `motion`: the same objects drawn to a thread and wound, as in the ablation, by splats of the capture and by own ones.
-`laws`: an object that falls on a floor as sand, snow and water, drawn in the same ways.
 """
-
-import time
 
 import equinox as eqx
 import jax
@@ -16,17 +13,9 @@ import pigjax as pj
 from benchmarks.ablation.reference import EXACT, render_parts, split
 from benchmarks.ablation.scenes import along, cut_out, turn
 from benchmarks.ablation.scores import image_scores, needles
-from benchmarks.common.pages import head, picture, row
+from benchmarks.common.pages import head, row
 from benchmarks.common.timing import measure
-from pigjax.core.linalg import svd
-from pigjax.coupling.liquid import liquid_rest, smoothed
-from pigjax.io import write_image
-from pigjax.mpm import fit_grid
-from pigjax.mpm.colliders import Plane
 from pigjax.splatting.types import as_splats
-
-PICTURE = "own_splats.png"
-FALLS, DROP = 0.24, 0.03  # time [s] and height above the floor [m] of part laws
 
 
 def _matter(gaussians, dx):
@@ -37,16 +26,15 @@ def _matter(gaussians, dx):
 
 def rest(options):
     """Table of the objects at rest."""
-    columns = "Gaussians", "particles", "own splats", "PSNR cut [dB]", "PSNR refitted [dB]", "processor s", "MB"
-    print(head("object", *columns))
+    print(
+        head("object", "Gaussians", "particles", "own splats", "PSNR cut [dB]", "PSNR refitted [dB]", "seconds", "MB")
+    )
     for name, gaussians in cut_out(options.objects).items():
         x = np.asarray(_matter(gaussians, options.dx).x)
-        begun = time.process_time()
         made = pj.make_own_splats(gaussians, x, dx=options.dx, steps=options.steps)
-        spent = time.process_time() - begun
+        size = sum(leaf.nbytes for leaf in jax.tree.leaves(made.gaussians)) / 1e6
         counts = len(gaussians), len(x), len(made.gaussians)
-        shown = made.start, made.psnr, spent, _megabytes(made.gaussians)
-        print(row(name, *counts, *(f"{value:.1f}" for value in shown)), flush=True)
+        print(row(name, *counts, *(f"{v:.1f}" for v in (made.start, made.psnr, made.seconds, size))), flush=True)
 
 
 def drawn_out(gaussians):
@@ -102,93 +90,12 @@ def motion(options):
             print(row(name, f"{len(scene)} {told}", *shown, f"{long:.1f}", f"{1e3 * drawn.seconds:.0f}"), flush=True)
 
 
-def laws(options):
-    """Table of an object that falls on a floor under three laws, beside parts of it that matter carries one by one."""
-    print(head("law", "splats", "PSNR", "SSIM", "holes %", "spill %", "needles %", "longest [cells]", "ms", "MB"))
-    name = options.objects[-1]
-    gaussians = cut_out([name])[name]
-    gaussians = eqx.tree_at(lambda g: g.sh, gaussians, gaussians.sh[:, :1])
-    ids, parts = np.ones(len(gaussians), int), split(gaussians, 0.5 * options.dx)
-    made, shown = None, []
-    for law in ("sand", "snow", "water"):
-        particles, table = pj.seed_particles(gaussians, ids, {1: pj.preset(law)}, spacing=options.dx)
-        if made is None:  # places are the same under every law
-            made = pj.make_own_splats(gaussians, particles.x, dx=options.dx, steps=options.steps)
-        x, F, at = fallen(particles, table, parts.positions(gaussians), options.dx)
-        moved = eqx.tree_at(lambda p: (p.x, p.F_visual), particles, (x, F))
-        own = pj.bind(
-            made.gaussians, np.ones(len(made.gaussians), int), _bare(moved), carrier=made.carrier, dx=options.dx
-        )
-        low, high = np.percentile(at, [1, 99], axis=0)
-        middle, extent = (low + high) / 2, float(np.linalg.norm(high - low))
-        eye = middle + extent * np.array([1.1, -0.9, 0.7])
-        camera = pj.look_at(eye, middle, focal=1.3 * options.pixels, width=options.pixels, height=options.pixels)
-        # a part is so small that its own stretch, which of matter that flows is no shape, does not count
-        truth = render_parts(gaussians, parts, at, np.tile(np.eye(3), (len(at), 1, 1)), at, camera, order="parts")
-        ways = {
-            "of the capture": (gaussians, moved, pj.bind(gaussians, ids, particles)),
-            "own": (made.gaussians, _bare(moved), own),
-        }
-        if law == "water":
-            rest = liquid_rest(np.asarray(particles.x), dx=options.dx)
-            smooth = smoothed(np.asarray(x), np.asarray(F), rest, dx=options.dx)
-            placed = eqx.tree_at(lambda p: (p.x, p.F_visual), _bare(moved), tuple(map(jnp.asarray, smooth)))
-            ways["own, smooth"] = (made.gaussians, placed, own)
-        pictures = [truth.rgb]
-        for told, (scene, matter, bound) in ways.items():
-
-            def draw(scene, matter, bound, camera):
-                splats = pj.deform(scene, matter, pj.ClampParams(), binding=bound)
-                return splats, pj.render(splats, camera, EXACT, background=1.0, outputs=("rgb", "alpha"))
-
-            drawn = measure(draw, scene, matter, bound, camera, windows=3)
-            splats, frame = drawn.result
-            scores = image_scores(frame, truth)
-            cells = [f"{float(scores['psnr']):.1f}", f"{float(scores['ssim']):.3f}"]
-            cells += [f"{100 * float(scores[key]):.2f}" for key in ("holes", "spill")]
-            cells.append(f"{100 * float(needles(splats, as_splats(scene))['needles']):.1f}")
-            cells.append(f"{4 * float(jnp.abs(svd(splats.factors)[1]).max()) / options.dx:.1f}")
-            cells += [f"{1e3 * drawn.seconds:.0f}", f"{_megabytes(scene):.1f}"]
-            print(row(law, f"{len(scene)} {told}", *cells), flush=True)
-            pictures.append(frame.rgb)
-        pictures += [jnp.ones_like(truth.rgb)] * (4 - len(pictures))
-        shown.append(np.concatenate([np.clip(np.asarray(rgb), 0, 1) for rgb in pictures], 1))
-    write_image(options.media / PICTURE, np.concatenate(shown))
-    told = "sand, snow and water: dense reference, splats of the capture, own splats, and with a smooth surface"
-    return f"\n{len(parts.parent)} parts of the reference.\n\n{picture(PICTURE, told)}"
-
-
-def fallen(particles, table, traced, dx):
-    """Matter after its fall: positions and deformations of its particles, and where the traced points are."""
-    x = np.concatenate([np.asarray(particles.x), traced])
-    # tracers are so light that they go with the others and do not act on them
-    light = np.full(len(traced), 1e-6 * float(particles.volume0.mean()))
-    volume = np.concatenate([np.asarray(particles.volume0), light])
-    everything = pj.make_particles(x, volume=volume, table=table)
-    floor = Plane([0.0, 0.0, float(x[:, 2].min()) - DROP], [0.0, 0.0, 1.0], mode="separate", friction=0.5)
-    end, _, health = pj.rollout(
-        everything, fit_grid(x, dx, margin=0.25), table, pj.SimConfig(), frames=6, frame_dt=FALLS / 6,
-        gravity=(0.0, 0.0, -9.81), colliders=(floor,),
-    )  # fmt: skip
-    health.raise_if_bad()
-    count = len(particles)
-    return end.x[:count], end.F_visual[:count], np.asarray(end.x)[count:]
-
-
-def _megabytes(gaussians):
-    return sum(leaf.nbytes for leaf in jax.tree.leaves(gaussians)) / 1e6
-
-
 def _bare(particles):
     """Particles that carry no Gaussians of the capture."""
     return eqx.tree_at(lambda p: p.gaussian, particles, jnp.full(len(particles), -1))
 
 
-PARTS = {
-    "rest": ("Own splats at rest", rest),
-    "motion": ("Own splats in motion", motion),
-    "laws": ("Own splats under three laws", laws),
-}
+PARTS = {"rest": ("Own splats at rest", rest), "motion": ("Own splats in motion", motion)}
 OPTIONS = {
     "objects": {"nargs": "+", "default": ["mug", "cube"], "help": "of the bundled tabletop"},
     "dx": {"type": float, "default": 0.012, "help": "grid spacing [m]"},
