@@ -1,4 +1,4 @@
-"""Splats of its own in a scene: which objects get them, how they join the scene's Gaussians, and liquid surfaces."""
+"""Splats of its own in a scene: which objects get them, how they join the scene's Gaussians; surfaces, grains."""
 
 from __future__ import annotations
 
@@ -20,11 +20,13 @@ from pigjax.coupling.own_splats import OwnSplats, make_own_splats
 from pigjax.mpm import Particles
 from pigjax.scene.arrangement import appended, with_bands
 from pigjax.scene.plan import Inputs, Plan
-from pigjax.scene.schema import Scene, VolumeSpec
+from pigjax.scene.schema import ObjectSpec, Scene, VolumeSpec
 from pigjax.scene.world import axis_of
 from pigjax.splat import Gaussians
 
 FLOWING = ("drucker_prager", "snow", "fluid", "foam", "plasticine")  # laws whose matter "auto" draws by own splats
+GRAINS = 6  # splats that each particle of grains has
+_GRAIN_SIZE = 0.6  # of these to that of one splat: their volumes add up to 1.3 of it, so that a heap hides its inside
 _TORN = 3.0  # stretch of a particle that its neighbours no longer share [-]
 _TORN_SHARE = 0.01  # of an object's particles, from which it counts as torn
 MADE = "own_splats"  # prefix of the arrays in the file of the rest state that a later run may use again
@@ -42,15 +44,17 @@ class Liquid:
 
 
 @dataclass
-class Liquids:
-    """The fluids of a scene that are drawn with a smooth surface."""
+class Surfaces:
+    """What poses matter otherwise than its deformation: smooth surfaces of fluids, and grains, which never deform."""
 
     parts: list[Liquid]
+    grains: Int[np.ndarray, "g"]  # particles that are drawn as grains
     dx: float  # [m]
 
     def __call__(self, gaussians: Gaussians, particles: Particles) -> tuple[Gaussians, Particles]:
-        """Gaussians with their sheen, and particles whose positions and deformations pose smooth surfaces. Host."""
+        """Gaussians with their sheen, and particles whose positions and deformations pose them. Host."""
         x, F = np.array(particles.x), np.array(particles.F_visual)
+        F[self.grains] = np.eye(3, dtype=F.dtype)
         sh = np.array(gaussians.sh) if any(part.sheen for part in self.parts) else None
         for part in self.parts:
             here, now = x[part.rows], liquid_kernels(x[part.rows].astype(np.float64), dx=self.dx)
@@ -128,7 +132,8 @@ def with_own(
     """
     if not names:
         return inputs, plan, {}
-    moving = list(laws_of(scene, plan))
+    laws = laws_of(scene, plan)
+    moving = list(laws)
     object_id, body = np.asarray(plan.labels.object_id), np.asarray(plan.particles.body)
     x = np.asarray(plan.particles.x)
     parts: list[tuple[Gaussians, np.ndarray]] = []
@@ -137,8 +142,8 @@ def with_own(
         entry = scene.objects[name]
         rows = np.flatnonzero(body == moving.index(name))
         if isinstance(entry, VolumeSpec):
-            poured = _of_volume(inputs.gaussians, plan, rows, entry.surface == "smooth")
-            parts.append((_fainter(poured, entry.transparency), rows))
+            poured, carriers = _of_volume(inputs.gaussians, plan, rows, entry, laws[name])
+            parts.append((_fainter(poured, entry.transparency), carriers))
             continue
         members = np.flatnonzero(object_id == inputs.ids[name])
         mine = jax.tree.map(lambda values, members=members: values[members], inputs.gaussians)
@@ -165,7 +170,6 @@ def with_own(
     carrier = np.concatenate([np.full(len(kept), -1), *(carriers for _, carriers in parts)])
     particles = replace(plan.particles, gaussian=jnp.asarray(place[np.asarray(plan.particles.gaussian)], jnp.int32))
     binding = bind(everything, labels, particles, carrier=carrier, dx=plan.dx)
-    laws = laws_of(scene, plan)
     smooth = [n for n in names if scene.objects[n].surface == "smooth" and laws[n] == "fluid"]
     sheens = [scene.objects[name].sheen for name in smooth]
     if any(sheens):
@@ -174,19 +178,47 @@ def with_own(
         "carrier": carrier,
         "smooth": np.asarray([inputs.ids[name] for name in smooth], int),
         "sheen": np.asarray(sheens, float),
+        "grains": np.asarray([inputs.ids[name] for name in names if is_grainy(scene.objects[name], laws[name])], int),
     }
     inputs = replace(inputs, gaussians=everything, arranged=True)
     return inputs, replace(plan, particles=particles, labels=labels, binding=binding), arrays
 
 
-def _of_volume(gaussians: Gaussians, plan: Plan, rows: Int[np.ndarray, "p"], smooth: bool) -> Gaussians:
-    """Splats of matter that was poured: those that its particles have, on a smooth surface where it is a fluid."""
+def is_grainy(entry: ObjectSpec, law: str) -> bool:
+    """Whether a volume is drawn as grains: its brightness varies, and it is no fluid."""
+    return isinstance(entry, VolumeSpec) and entry.grain > 0 and law != "fluid"
+
+
+def _of_volume(
+    gaussians: Gaussians, plan: Plan, rows: Int[np.ndarray, "p"], entry: VolumeSpec, law: str
+) -> tuple[Gaussians, Int[np.ndarray, "m"]]:
+    """Splats of matter that was poured, and the particle of each.
+
+    They are those that its particles have, on a smooth surface where it is a fluid, and several where it has grains.
+    """
     carried = np.asarray(plan.particles.gaussian)[rows]
     mine = jax.tree.map(lambda values: values[carried], gaussians)
-    law = plan.table.laws[int(np.asarray(plan.particles.body)[rows[0]])]
-    if not (smooth and law == "fluid"):
-        return mine
-    return with_kernels(mine, liquid_kernels(np.asarray(plan.particles.x, np.float64)[rows], dx=plan.dx))
+    if is_grainy(entry, law):
+        return _grains(mine, entry), np.repeat(rows, GRAINS)
+    if entry.surface == "smooth" and law == "fluid":
+        mine = with_kernels(mine, liquid_kernels(np.asarray(plan.particles.x, np.float64)[rows], dx=plan.dx))
+    return mine, rows
+
+
+def _grains(gaussians: Gaussians, entry: VolumeSpec) -> Gaussians:
+    """Several small splats in the place of each round one, each of its own brightness."""
+    random, kind = np.random.default_rng(0), gaussians.means.dtype
+    many = jax.tree.map(lambda values: jnp.repeat(values, GRAINS, 0), gaussians)
+    # a round splat of a lattice has half its cell as standard deviation: grains are anywhere in the cell
+    reach = np.exp(np.asarray(many.log_scales))
+    shift = reach * random.uniform(-1, 1, reach.shape)
+    bright = np.clip(np.asarray(entry.colour) * (1 + entry.grain * random.normal(size=(len(many), 1))), 0, 1)
+    return replace(
+        many,
+        means=many.means + jnp.asarray(shift, kind),
+        log_scales=many.log_scales + np.log(_GRAIN_SIZE),
+        sh=many.sh.at[:, 0].set(jnp.asarray((bright - 0.5) / SH_CONSTANT, kind)),
+    )
 
 
 def _fainter(gaussians: Gaussians, transparency: float) -> Gaussians:
@@ -211,29 +243,25 @@ def _stored(arrays: Mapping[str, np.ndarray], prefix: str, mark: str) -> OwnSpla
     return OwnSplats(gaussians, arrays[f"{prefix}_carrier"], *arrays[f"{prefix}_scores"].tolist())
 
 
-def liquids_of(
-    smooth: Mapping[int, float],
-    objects: Int[np.ndarray, "p"],
-    x: Float[Array, "p 3"],
-    carrier: Int[np.ndarray, "n"],
-    dx: float,
-) -> Liquids | None:
-    """Surfaces at rest of the fluids that are drawn smooth; None where there are none. Host.
+def surfaces_of(
+    stored: Mapping[str, np.ndarray], objects: Int[np.ndarray, "p"], x: Float[Array, "p 3"], dx: float
+) -> Surfaces | None:
+    """Surfaces at rest of the fluids that are drawn smooth, and what is drawn as grains; None without any. Host.
 
     Args:
-        smooth: sheen of each of these fluids, by its id.
+        stored: arrays of `with_own`.
         objects: id of each particle's object.
         x: particles at rest [m].
-        carrier: particle of each Gaussian, -1 for those that were not made for their matter.
         dx: grid spacing [m].
     """
-    parts = []
-    for number, strength in smooth.items():
+    parts, carrier = [], stored.get("carrier", np.zeros(0, int))  # particle of each Gaussian, or -1
+    for number, strength in smooth_of(stored).items():
         rows = np.flatnonzero(objects == number)
         splats = np.flatnonzero(np.isin(carrier, rows))
         rest = liquid_rest(np.asarray(x)[rows], dx=dx)
         parts.append(Liquid(rows, rest, strength, splats, np.searchsorted(rows, carrier[splats])))
-    return Liquids(parts, dx) if parts else None
+    grains = np.flatnonzero(np.isin(objects, stored.get("grains", np.zeros(0, int))))
+    return Surfaces(parts, grains, dx) if parts or len(grains) else None
 
 
 def smooth_of(arrays: Mapping[str, np.ndarray]) -> dict[int, float]:

@@ -22,7 +22,7 @@ from pigjax.core.placing import similarity
 from pigjax.coupling.binding import Binding, bind, deform
 from pigjax.mpm import Particles
 from pigjax.mpm.colliders import Collider, SampledDistance
-from pigjax.scene.own import Liquids, liquids_of, smooth_of
+from pigjax.scene.own import Surfaces, surfaces_of
 from pigjax.scene.plan import Inputs, clamp_params, make_cameras, read_gaussians, read_inputs
 from pigjax.scene.schema import Scene, load_scene
 from pigjax.scene.world import axis_of
@@ -104,7 +104,7 @@ class Run:
     mode: str = "aligned"  # of the clamp
     # particle of each Gaussian that was made for its matter, -1 for the others; None: there are none
     carrier: Int[np.ndarray, "n"] | None = field(default=None, repr=False)
-    smooth: dict[int, float] = field(default_factory=dict)  # sheen of fluids with a smooth surface, by id
+    stored: Mapping[str, np.ndarray] = field(default_factory=dict)  # arrays of `with_own`: what is smooth, what grains
 
     @property
     def to_capture(self) -> Float[np.ndarray, "4 4"]:
@@ -159,8 +159,8 @@ class Run:
 
     def _posed(self, frame: int) -> Splats:
         gaussians, particles = self.gaussians, self.particles(frame)
-        if self.liquids is not None:
-            gaussians, particles = self.liquids(gaussians, particles)
+        if self.surfaces is not None:
+            gaussians, particles = self.surfaces(gaussians, particles)
         return _pose(gaussians, particles, self.clamp, self.binding, self.mode)
 
     def _shaded(self, splats: Splats, light: Light) -> Splats:
@@ -175,11 +175,11 @@ class Run:
         return light_transmittance(splats, jnp.asarray(self.moving), self.scene.light.to_light())
 
     @cached_property
-    def liquids(self) -> Liquids | None:
-        """Fluids that are drawn with a smooth surface."""
+    def surfaces(self) -> Surfaces | None:
+        """Fluids that are drawn with a smooth surface, and grains."""
         if self.carrier is None:
             return None
-        return liquids_of(self.smooth, self.rows["object"], self.rest.x, self.carrier, self.dx)
+        return surfaces_of(self.stored, self.rows["object"], self.rest.x, self.dx)
 
     @cached_property
     def moving(self) -> np.ndarray:
@@ -276,7 +276,7 @@ def load_run(folder: str | os.PathLike[str], *, scene: Scene | None = None) -> R
         clamp=clamp_params(scene.clamp),
         mode=scene.clamp.mode,
         carrier=stored.get("carrier"),
-        smooth=smooth_of(stored),
+        stored={name: stored[name] for name in ("carrier", "smooth", "sheen", "grains") if name in stored},
     )
 
 

@@ -33,7 +33,7 @@ from pigjax.scene.arrangement import arrange
 from pigjax.scene.budget import ScenePlan, refined
 from pigjax.scene.costs import Comparison, Pace, Prediction, predict
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
-from pigjax.scene.own import MADE, Liquids, chosen, is_torn, laws_of, liquids_of, smooth_of, with_own
+from pigjax.scene.own import MADE, Surfaces, chosen, is_torn, laws_of, surfaces_of, with_own
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
 from pigjax.scene.replay import COLLIDER_FILE, REST_FILE, SCENE_FILE, rows_of, store_colliders, store_rest
 from pigjax.scene.report import RunReport
@@ -162,7 +162,7 @@ def _run(
         with report.stage("simulate"):
             for _ in states:
                 pass
-    seen, shown, liquids = inputs, plan, None
+    seen, shown, surfaces = inputs, plan, None
     if own_wanted:
         with report.stage("splats"):
             tell("splats", 0, 1)
@@ -171,14 +171,14 @@ def _run(
             if names:
                 rows["gaussian"] = np.asarray(shown.particles.gaussian)
                 _store(scene, seen, shown, rows, out, key, own)
-                liquids = liquids_of(smooth_of(own), rows["object"], plan.particles.x, own["carrier"], plan.dx)
+                surfaces = surfaces_of(own, rows["object"], plan.particles.x, plan.dx)
                 report.sizes["own_splats_of"] = {
                     name: int(np.sum(np.asarray(shown.labels.object_id) == inputs.ids[name])) for name in names
                 }
             tell("splats", 1, 1)
     with report.stage("draw"):
         pictures = pictures or _Pictures.of(scene, seen, shown)
-        _draw(scene, seen, shown, shown.labels, pictures, out, key, report, tell, states, liquids)
+        _draw(scene, seen, shown, shown.labels, pictures, out, key, report, tell, states, surfaces)
     if followed is not None:
         with report.stage("estimate"):
             tell("estimate", 0, 1)
@@ -481,7 +481,7 @@ def _draw(
     report: RunReport,
     tell: Progress,
     states: Iterator[int],
-    liquids: Liquids | None,
+    surfaces: Surfaces | None,
 ) -> None:
     """Pose and render each saved state, once `states` says that it is there; remove it where it is not to be kept."""
     frames, gaussians = scene.simulation.frames, inputs.gaussians
@@ -493,7 +493,7 @@ def _draw(
         state = io.load_state(out / "states", frame, signature=key)
         there = tuple(np.asarray(state[name], plan.particles.x.dtype) for name in ("x", "F_visual"))
         particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, there)
-        shown, particles = (gaussians, particles) if liquids is None else liquids(gaussians, particles)
+        shown, particles = (gaussians, particles) if surfaces is None else surfaces(gaussians, particles)
         shade = drawn.shade
         if shade is not None and drawn.lit is not None:
             reached = drawn.lit(shown, particles, plan.binding, *shade[:2])

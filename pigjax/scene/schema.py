@@ -335,7 +335,9 @@ class VolumeSpec(ObjectSpec, frozen=True, kw_only=True):
     """
 
     colour: Annotated[Triple, Limits(0, 1)]  # of its splats
-    grain: Annotated[float, Limits(0, 1)] = 0.0  # by which the brightness of its splats varies, one standard deviation
+    # by which the brightness of its splats varies, one standard deviation; above 0, what is no fluid is drawn as
+    # grains: six small splats a particle, which never deform
+    grain: Annotated[float, Limits(0, 1)] = 0.0
     fills: str | None = None  # name of the hollow object that it is in
     level: Annotated[float, Limits(0, 1, above=True)] = 0.8  # share of the vessel's depth
     lower: Annotated[Triple, _PLACE] | None = None  # corner of a box

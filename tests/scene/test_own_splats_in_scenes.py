@@ -16,7 +16,7 @@ from pigjax.coupling.liquid import SCHLICK
 from pigjax.coupling.own_splats import make_own_splats
 from pigjax.scene import export_run, load_run, run_scene, scene_from
 from pigjax.scene import own as module
-from pigjax.scene.own import chosen, is_torn
+from pigjax.scene.own import chosen, is_torn, smooth_of
 
 
 def quick(gaussians, x, **settings):
@@ -64,7 +64,7 @@ def test_own_splats_are_drawn_stored_and_used_again(folder, tmp_path):
     assert len(run.gaussians) > len(plain.gaussians)
     assert (run.rows["object"] == 1).all()
     assert (run.rows["gaussian"] == -1).all()
-    assert run.liquids is not None
+    assert run.surfaces is not None
     rest = run.splats(0)
     np.testing.assert_allclose(rest.means, run.gaussians.means, atol=1e-5)
     moved = run.splats(1)
@@ -115,18 +115,18 @@ def test_objects_that_are_carried_keep_their_splats_beside_own_ones(tmp_path):
 def test_sheen_brightens_a_surface_seen_at_a_low_angle(folder, tmp_path):
     run_scene(scene(folder, splats="own", surface="smooth", inside=[0.0, 0.2, 0.6], sheen=0.8), tmp_path)
     run = load_run(tmp_path)
-    assert run.smooth == {1: 0.8}
+    assert smooth_of(run.stored) == {1: 0.8}
     still, moved = run.gaussians, run.splats(1)
     assert still.sh.shape[1] == 9
     assert not np.asarray(still.sh)[:, 1:].any()  # at rest in the file there is none: it follows the surface
-    (liquid,) = run.liquids.parts
+    (liquid,) = run.surfaces.parts
     kernels = liquid.rest.kernels
     top = int(np.argmax(kernels.sided * kernels.normals[:, 2]))
     (mine,) = np.nonzero(liquid.at == top)
     axis = kernels.normals[top] / np.linalg.norm(kernels.normals[top])
     side = np.cross(axis, [1.0, 0.0, 0.0])
     directions = jnp.asarray(np.stack([axis, side / np.linalg.norm(side)]), jnp.float32)
-    shone, _ = run.liquids(run.gaussians, run.particles(0))
+    shone, _ = run.surfaces(run.gaussians, run.particles(0))
     colours = np.einsum("dk,kc->dc", np.asarray(sh_basis(directions, 2)), np.asarray(shone.sh)[mine[0]]) + 0.5
     base = np.asarray(still.sh)[mine[0], 0] * SH_CONSTANT + 0.5
     np.testing.assert_allclose(colours[0], base, atol=1e-5)

@@ -1,13 +1,17 @@
 """`[volumes]`: matter that nobody captured, poured into shapes and vessels, with splats of its own."""
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import ball, values
 
-from pigjax import io
+from pigjax import ClampParams, deform, io
 from pigjax.core.errors import SceneError
+from pigjax.core.gaussians import SH_CONSTANT
 from pigjax.scene import export_run, load_run, run_scene, scene_from
 from pigjax.scene.arrangement import arrange
+from pigjax.scene.own import GRAINS, smooth_of, surfaces_of, with_own
 from pigjax.scene.plan import make_plan, provenance, read_inputs, segment
 
 WATER = {"material": "water", "bulk_modulus": 2e3, "colour": [0.2, 0.4, 0.8]}
@@ -82,13 +86,34 @@ def test_run_keeps_and_draws_it(folder, tmp_path):
     assert mine.sum() == report.sizes["particles_of"]["drop"]
     assert (run.carrier[mine] >= 0).all()
     assert (run.carrier[~mine] == -1).all()
-    assert run.smooth == {number: 0.5}
+    assert smooth_of(run.stored) == {number: 0.5}
     before, after = run.splats(0), run.splats(1)
     np.testing.assert_allclose(before.means, run.gaussians.means, atol=1e-5)
     assert np.asarray(after.means - before.means)[mine, 2].max() < 0  # it falls
     assert float(np.asarray(after.opacities)[mine].max()) < 0.8
     (path,) = export_run(run, "surface", tmp_path / "out", frames=[1], objects=["drop"])
     assert path.is_file()
+
+
+def test_grains_never_deform(folder):
+    shape = {"centre": [2.0, 0.0, 0.5], "radius": 0.2, "material": "sand", "colour": [0.8, 0.6, 0.3], "grain": 0.2}
+    arranged, inputs, plan = planned(scene(folder, {"heap": shape}))
+    inputs, plan, stored = with_own(arranged, inputs, plan, ["heap"])
+    objects = np.where(np.asarray(plan.particles.body) == 1, inputs.ids["heap"], 1)
+    heap = np.flatnonzero(objects == inputs.ids["heap"])
+    grains = np.flatnonzero(np.isin(stored["carrier"], heap))
+    np.testing.assert_array_equal(np.bincount(stored["carrier"][grains], minlength=len(objects))[heap], GRAINS)
+    brightness = np.asarray(inputs.gaussians.sh)[grains, 0].mean(1) * SH_CONSTANT + 0.5
+    assert np.std(brightness) == pytest.approx(0.2 * 0.57, rel=0.2)  # less than that where it is held to 1
+    x = np.asarray(plan.particles.x)
+    surfaces = surfaces_of(stored, objects, plan.particles.x, plan.dx)
+    flat = jnp.tile(jnp.diag(jnp.asarray([3.0, 1.0, 0.2])), (len(x), 1, 1))
+    moved = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, (plan.particles.x + 0.1, flat))
+    _, posed = surfaces(inputs.gaussians, moved)
+    rest, after = (deform(inputs.gaussians, p, ClampParams(), binding=plan.binding) for p in (plan.particles, posed))
+    np.testing.assert_allclose(after.factors[grains], rest.factors[grains], atol=1e-6)
+    np.testing.assert_allclose(after.means[grains], rest.means[grains] + 0.1, atol=1e-5)
+    np.testing.assert_array_equal(posed.F_visual[objects == 1], flat[objects == 1])  # other matter keeps its own
 
 
 def test_its_looks_change_no_state(folder):

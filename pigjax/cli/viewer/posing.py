@@ -15,7 +15,7 @@ from pigjax.clamp import ClampParams
 from pigjax.core.arrays import einsum
 from pigjax.coupling.binding import Binding, deform
 from pigjax.mpm import Particles
-from pigjax.scene.own import Liquids
+from pigjax.scene.own import Surfaces
 from pigjax.splat import Gaussians
 
 MODES = ("aligned", "literal", "covariance", "fixed")
@@ -28,13 +28,13 @@ class Poser:
         gaussians: the scene at rest.
         particles: at rest, of `seed_particles`.
         binding: carriers of Gaussians without a particle; None: there are none.
-        liquids: fluids with a smooth surface; None: there are none.
+        surfaces: fluids with a smooth surface; None: there are none.
     """
 
     def __init__(
-        self, gaussians: Gaussians, particles: Particles, binding: Binding | None, liquids: Liquids | None = None
+        self, gaussians: Gaussians, particles: Particles, binding: Binding | None, surfaces: Surfaces | None = None
     ) -> None:
-        self.gaussians, self.particles, self.binding, self.liquids = gaussians, particles, binding, liquids
+        self.gaussians, self.particles, self.binding, self.surfaces = gaussians, particles, binding, surfaces
         own = np.asarray(particles.gaussian)
         self._with_gaussian = np.flatnonzero(own >= 0)
         carried = [own[self._with_gaussian]] + ([] if binding is None else [np.asarray(binding.gaussian)])
@@ -53,8 +53,8 @@ class Poser:
         moved = eqx.tree_at(
             lambda p: (p.x, p.F_visual), self.particles, (jnp.asarray(x, kind), jnp.asarray(F_visual, kind))
         )
-        if self.liquids is not None:
-            _, moved = self.liquids(self.gaussians, moved)
+        if self.surfaces is not None:
+            _, moved = self.surfaces(self.gaussians, moved)
         means, covariances = _pose(self.gaussians, moved, self.binding, jnp.asarray(self.rows), clamp, mode)
         return np.asarray(means), np.asarray(covariances)
 

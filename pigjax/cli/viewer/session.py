@@ -280,7 +280,7 @@ class Session:
 
     def _take_run(self, run: Run) -> None:
         self.refresh_frames()
-        self.poser = Poser(run.gaussians, run.rest, run.binding, run.liquids)
+        self.poser = Poser(run.gaussians, run.rest, run.binding, run.surfaces)
         self.colliders = tuple(run.colliders().values())
         self._object_of_particle = np.asarray(run.rows["object"])
 
