@@ -17,22 +17,24 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 
+sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import msgspec
+import numpy as np
+from field_comments import comment_of
+from msgspec.structs import fields
+from typer.models import ArgumentInfo, ParameterInfo
+
+from pigjax.cli import app
+from pigjax.core.checks import Limits
+from pigjax.mpm.materials import LAWS, PRESETS, Parameters, material_table, preset
+from pigjax.mpm.materials.table import LIMITS
+from pigjax.scene.decode import Section, numbers_of, sections_of, wanted
+from pigjax.scene.schema import ObjectSpec, Scene, SimulationSpec
+from pigjax.study.schema import OPTIONS, Study
+
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
-
-import msgspec  # noqa: E402
-import numpy as np  # noqa: E402
-from field_comments import comment_of  # noqa: E402
-from msgspec.structs import fields  # noqa: E402
-from typer.models import ArgumentInfo, ParameterInfo  # noqa: E402
-
-from pigjax.cli import app  # noqa: E402
-from pigjax.core.checks import Limits  # noqa: E402
-from pigjax.mpm.materials import LAWS, PRESETS, Parameters, material_table, preset  # noqa: E402
-from pigjax.mpm.materials.table import LIMITS  # noqa: E402
-from pigjax.scene.decode import Section, numbers_of, sections_of, wanted  # noqa: E402
-from pigjax.scene.schema import ObjectSpec, Scene, SimulationSpec  # noqa: E402
-from pigjax.study.schema import OPTIONS, Study  # noqa: E402
 
 FROM_OUTSIDE = {"folder"}  # set by the reader of a file, and not a field of it
 CELL, CFL = 0.01, SimulationSpec().cfl  # of the steps on the page of materials [m], [-]

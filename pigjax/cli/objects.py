@@ -166,7 +166,7 @@ def reconstruct(
 
 
 def _plan(views: Any, config: Any, points: Any) -> str:
-    """What a reconstruction will do, in a line."""
+    """Plan line of a reconstruction: photos, size, splats, steps."""
     held_out, camera = views.held_out, views.cameras
     start = "random points" if points is None else f"{len(points[0]):,} sparse points"
     start += f" and a far shell of {int(config.shell * config.splats):,}" if config.shell else ""

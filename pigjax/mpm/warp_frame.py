@@ -147,7 +147,7 @@ def whole_frames(
 
 
 def _matter(statics: StepStatics, context: StepContext, states: tuple[State, ...]) -> _Matter:
-    """What the steps share, from the states of each law [p r]."""
+    """Arrays that all steps share, from the states of each law [p r]."""
     dtype, moduli = context.dt.dtype, []
     for parameters, state in zip(context.parameters, states):
         own = parameters if state.row is None else parameters_of(parameters, state.row[:, 0])

@@ -79,7 +79,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class ScenePlan:
-    """What a run requires and costs, and the settings that keep a budget; `plan_scene` makes it."""
+    """Requirements and cost of a run, and the settings that keep a budget; `plan_scene` makes it."""
 
     scene: Scene  # with the chosen settings
     chosen: Choice  # the settings that keep the budget
@@ -92,7 +92,7 @@ class ScenePlan:
 
     @property
     def required(self) -> Required:
-        """What the chosen settings require."""
+        """Requirements of the chosen settings."""
         return self.chosen.required
 
     @property

@@ -36,7 +36,7 @@ class Body(NamedTuple):
 
 @dataclass(frozen=True)
 class Required:
-    """What a run has to do, in numbers."""
+    """Work of a run, in numbers."""
 
     bodies: tuple[Body, ...]
     dx: float  # grid spacing [m]

@@ -1,4 +1,4 @@
-"""What a scene requires, in numbers: quickly estimated from its files, or counted from its particles."""
+"""Requirements of a scene, in numbers: estimated from its files, or counted from its particles."""
 
 from __future__ import annotations
 
