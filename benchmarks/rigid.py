@@ -66,7 +66,8 @@ def floating(options):
     """A block as wide as half of the tank, in a slice of four cells from wall to wall, over two seconds from rest."""
     side, depth, wide, high, sunk = 0.6, 0.3, 0.3, 0.2, 0.1
     wanted = float(RIGID.density / WATER.density)
-    print(head("cells across the tank", "particles", "steps", "share under water", "least, most", "of that wanted"))
+    measures = "share under water", "least, most", "water's volume over that at rest", "displaced over its weight"
+    print(head("cells across", "particles", "steps", *measures))
     for cells in options.across:
         dx = side / cells
         low = (WALL - 1) * dx  # the last node that the walls hold
@@ -94,7 +95,8 @@ def floating(options):
         levels = 2 * np.stack([own[there, 2].mean() for own, there in zip(pool, apart)])
         under = (levels - bottoms) / high
         spread = f"{under.min():.3f}, {under.max():.3f}"
-        each = f"{under.mean():.3f}", spread, f"{under.mean() / wanted:.3f}"
+        over = (levels * side - wide * (levels - bottoms)).mean() / (len(water) * (dx / 2) ** 3 / (4 * dx))
+        each = f"{under.mean():.3f}", spread, f"{over:.3f}", f"{under.mean() / wanted / over:.3f}"
         print(row(cells, len(particles), frames * steps, *each))
     return (
         f"\nWanted: {wanted:.2f}. Means, least and most of the second half of 2 s; the water's level is twice the mean "
