@@ -65,6 +65,9 @@ def soft_surface_depth(
     def passed(transmittance):
         return jax.nn.sigmoid((tau_T - transmittance) / temperature)
 
+    if len(splats) == 0:
+        none = jnp.zeros((camera.height, camera.width), splats.means.dtype)
+        return none + 1.0, none, jnp.zeros((), jnp.int32)
     blending = blend_config(camera, config, len(splats), surface=True)
     if blending.warp:
         depth, last, overflow = _soft_surface_by_warp(splats, camera, config, blending, tau_T, temperature)
@@ -108,6 +111,8 @@ def credits_of_candidates(
         mask: id of each pixel.
         candidates: ids of each splat; a candidate of -1 gets nothing.
     """
+    if len(splats) == 0:
+        return jnp.zeros(candidates.shape, splats.means.dtype)
     blending = blend_config(camera, config, len(splats), surface=True)
     if blending.warp:
         return _credits_by_warp(splats, camera, config, blending, mask, candidates)

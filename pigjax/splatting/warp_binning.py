@@ -42,10 +42,7 @@ def slots_by_tile(
         slots that no tile owns.
     """
     shapes = lax.stop_gradient(shapes)
-    count, tiles, dtype = len(shapes), len(open_tiles), shapes.dtype
-    if count == 0:
-        none = jnp.zeros(slots, jnp.int32)
-        return none, none + tiles, jnp.zeros(tiles + 1, jnp.int32)
+    tiles, dtype = len(open_tiles), shapes.dtype
     limits = jnp.full((1, 4), least_exponent, dtype)
     empty, is_open = jnp.zeros((1, 2 * slots), jnp.int32), open_tiles.astype(jnp.int32)[None]
     arrays = (shapes, low, size, end, before)

@@ -99,9 +99,6 @@ def test_single_precision_draws_and_trains_alike():
 def test_no_splat_and_one(x64, count):
     splats = jax.tree.map(lambda part: part[:count], scene(1))
     check_equal(drawn(splats, "warp", ("rgb", "alpha")), drawn(splats, "xla", ("rgb", "alpha")), 1e-12)
-    if count == 0:  # votes list without the loop that ends at once
-        mask, candidates = jnp.zeros((CAMERA.height, CAMERA.width), jnp.int32), jnp.zeros((0, 2), jnp.int32)
-        assert credits_of_candidates(splats, CAMERA, RenderConfig(backend="warp"), mask, candidates).shape == (0, 2)
 
 
 @needs_warp
@@ -152,6 +149,17 @@ def test_credits_are_those_of_xla(x64):
         return credits_of_candidates(splats, CAMERA, RenderConfig(backend=backend), mask, candidates)
 
     check_equal(credits("warp"), credits("xla"), 1e-10)
+
+
+@pytest.mark.parametrize("backend", ["auto", "xla", pytest.param("warp", marks=needs_warp)])
+def test_no_splat_gives_no_credit_and_no_surface(backend):
+    splats, config = jax.tree.map(lambda part: part[:0], scene(1)), RenderConfig(backend=backend)
+    mask, candidates = jnp.zeros((CAMERA.height, CAMERA.width), jnp.int32), jnp.zeros((0, 2), jnp.int32)
+    assert credits_of_candidates(splats, CAMERA, config, mask, candidates).shape == (0, 2)
+    depth, presence, overflow = soft_surface_depth(splats, CAMERA, config, tau_T=0.5, temperature=0.1)
+    assert (depth == 1).all()
+    assert not presence.any()
+    assert overflow == 0
 
 
 @needs_warp
