@@ -222,7 +222,7 @@ def _fault_of_driver() -> str | None:
 
 def _device() -> jax.Device:
     """JAX's default device, which a user may have set as a device or as a platform."""
-    chosen = jax.config.jax_default_device
+    chosen = getattr(jax.config, "jax_default_device", None)
     return jax.devices(chosen)[0] if chosen is None or isinstance(chosen, str) else chosen
 
 
