@@ -2,7 +2,8 @@
 
 Correctness comes first, and what is wrong ends the run. Without a CUDA device the kernels are compared on Warp's CPU
 target, small, and no time is told. Rivals are measured where they are installed: plain Warp kernels in a CUDA graph
-come with `pip install 'pigjax[gpu]'`, splax with `pip install splax`.
+come with `pip install 'pigjax[gpu]'`, splax with `pip install splax`. Each part has its share of the time; what does
+not fit is told as "left out".
 """
 
 import gc
@@ -20,7 +21,7 @@ import numpy as np
 
 from benchmarks import mpm
 from benchmarks.common.pages import TABLETOP, head, row
-from benchmarks.common.timing import in_turn, measure
+from benchmarks.common.timing import in_turn, measure, timed
 from benchmarks.render import ball
 from pigjax import FitConfig, RenderConfig, load_points, load_views, reconstruct, render
 from pigjax.core.backend import backend_in_use
@@ -41,6 +42,9 @@ MATTER = ((10_000, 64), (100_000, 64), (500_000, 128), (1_000_000, 128), (4_000_
 GRADIENTS = ((10_000, 64), (100_000, 64), (1_000_000, 128))
 PICTURES = ((10_000, 256, 256), (100_000, 512, 512), (1_000_000, 1920, 1080))  # splats, pixels
 STEPS = 40  # substeps of a frame
+# seconds of six minutes for each part; compilation takes most of them
+SHARES = {"check": 45, "matter": 105, "gradient": 45, "batch": 25, "drawing": 55, "demo": 50, "training": 35}
+LEFT_OUT, PEAK = "left out", "peak GB so far"
 NO_GPU = "This machine has no CUDA device that JAX uses: nothing is timed."
 
 
@@ -68,7 +72,7 @@ def check(_):
     for case in cases:
         roads = [name for name in ROADS if name != "frames" or "deterministic" not in case]
         heights = {name: _height(count, nodes, 8, **ROADS[name], **case) for name in roads}
-        found = {name: jax.jit(jax.value_and_grad(run))(start) for name, (run, start) in heights.items()}
+        found = {name: jax.jit(jax.value_and_grad(run))(*start) for name, (run, start) in heights.items()}
         said = ", ".join(f"{key} {value}" for key, value in case.items())
         for name in roads[1:]:
             tell(f"matter by {name}, 8 steps and their gradient {said}", found[name], found["xla"], 1e-3)
@@ -87,32 +91,50 @@ def check(_):
 
 
 def matter(options):
-    """Frames of 40 substeps of a falling cube, as `python -m benchmarks mpm speed`, and the bars of the issue."""
+    """Frames of 40 substeps of the falling cube of `python -m benchmarks mpm speed`, each one compiled program."""
     if not (on_gpu() or options.tiny):
         return NO_GPU
-    laws = ("fixed_corotated", "neo_hookean")
-    columns = (*ROADS, "transfers, in order", "plain Warp", "frames / transfers", "frames / plain Warp", "peak GB")
+    in_time, laws = _clock(options, "matter"), ("neo_hookean", "fixed_corotated")
+    columns = (*ROADS, "transfers, in order", "plain Warp", "frames / transfers", "frames / plain Warp", "bar", PEAK)
     print(head("M particle updates/s", "law", *columns))
-    for count, nodes in _chosen(MATTER, options):
+    cases = _chosen(MATTER, options)
+    for number, (count, nodes) in enumerate(cases):
+        later = 10.0 * (len(cases) - 1 - number)  # seconds that the first columns of the other rows need
         for law in laws:
-            rates = [_rate(law, count, nodes, **road) for road in ROADS.values()]
-            gain = f"{rates[2] / rates[1]:.2f}"
-            rates.append(_rate(law, count, nodes, backend="warp", deterministic=True))
-            plain = _plain_rate(count, nodes) if law == "neo_hookean" else None
-            ratio = "" if plain is None else f"{rates[2] / plain:.2f}"
-            told = [f"{rate / 1e6:{'.3f' if options.tiny else '.0f'}}" for rate in rates]
-            print(row(f"{_size(count)}/{nodes}³", law, *told, "" if plain is None else f"{plain / 1e6:.0f}", gain,
-                      ratio, _peak()))  # fmt: skip
+            first = law == laws[0]
+            rates = {"frames": _rate(law, count, nodes, **ROADS["frames"]) if in_time() else None}
+            rates["plain Warp"] = "" if not first else _plain_rate(count, nodes) if in_time() else None
+            for name in ("xla", "transfers", "transfers, in order"):
+                ways = ROADS | {"transfers, in order": {"backend": "warp", "deterministic": True}}
+                wanted = first or name == "xla"  # what the transfers do is the same for every law
+                rates[name] = "" if not wanted else _rate(law, count, nodes, **ways[name]) if in_time(later) else None
+            told = [_told(rates[name], 3 if options.tiny else 0) for name in columns[:5]]
+            gains = [_ratio(rates["frames"], rates[name]) for name in ("transfers", "plain Warp")]
+            bar = "" if options.tiny else _bar_of_matter(count, nodes, rates["frames"], rates["plain Warp"])
+            print(row(f"{_size(count)}/{nodes}³", law, *told, *gains, bar, _peak()))
             gc.collect()
     return None
 
 
+def _bar_of_matter(count, nodes, ours, plain):
+    """Whether the bars of a row are met."""
+    if ours is None:
+        return ""
+    least = {(10_000, 64): 150e6, (100_000, 64): 900e6, (500_000, 128): 1.2e9}.get((count, nodes), 0.0)
+    told = [_bar(ours >= least, f"≥ {least / 1e6:.0f}")] if least else []
+    if count >= 100_000 and plain:
+        told.append(_bar(ours >= 1.5 * plain, "≥ 1.5 plain"))
+    return ", ".join(told)
+
+
 def _rate(law, count, nodes, **config):
     """Particle updates/s."""
-    _, seconds, _, health = mpm.ours(law, count, nodes, devices=1, **config)
+    run, start = _falling(law, count, nodes, STEPS, **config)
+    found = timed(partial(jax.jit(run), *start), windows=5, seconds=4)
+    _, health = found.result
     if health.is_broken():
         sys.exit(f"{law} {count}/{nodes}³ {config}: {'; '.join(health.problems())}")
-    return count / seconds
+    return count * STEPS / found.seconds
 
 
 def _plain_rate(count, nodes):
@@ -129,32 +151,46 @@ def _plain_rate(count, nodes):
     return count * STEPS / sorted(times)[2]
 
 
-def _height(count, nodes, steps, **config):
-    """Mean height after steps as a function of the velocities, and these."""
-    particles, _, table = mpm.scene("neo_hookean", count, nodes)
+def _falling(law, count, nodes, steps, **config):
+    """A frame as a function of velocities and all numbers of particles: positions after it and health; and these."""
+    particles, _, table = mpm.scene(law, count, nodes)
     grid = fit_grid(particles.x, 1 / nodes, margin=2 / nodes)
     settings = SimConfig(substeps=steps, devices=1, **config)
+    numbers, whole = eqx.partition(particles, eqx.is_inexact_array)  # arguments, for constants of a program are slow
 
-    def height(v):
-        moved = eqx.tree_at(lambda p: p.v, particles, v)
-        end, _, _ = rollout(moved, grid, table, settings, frames=1, frame_dt=steps * mpm.DT, gravity=mpm.DOWN)
-        return end.x[:, 1].mean()
+    def run(v, numbers):
+        moved = eqx.tree_at(lambda p: p.v, eqx.combine(numbers, whole), v)
+        end, _, health = rollout(moved, grid, table, settings, frames=1, frame_dt=steps * mpm.DT, gravity=mpm.DOWN)
+        return end.x, health
 
-    return height, particles.v
+    return run, (particles.v, numbers)
+
+
+def _height(count, nodes, steps, **config):
+    """Mean height after steps as a function of the same, and these."""
+    run, start = _falling("neo_hookean", count, nodes, steps, **config)
+    return lambda *start: run(*start)[0][:, 1].mean(), start
 
 
 def gradient(options):
     """The gradient of a frame, with checkpoints, in forward passes."""
     if not (on_gpu() or options.tiny):
         return NO_GPU
-    print(head("case", "road", "forward ms", "forward and backward ms", "in forwards"))
+    in_time = _clock(options, "gradient")
+    print(head("case", "road", "forward ms", "forward and backward ms", "in forwards", "bar"))
     for count, nodes in _chosen(GRADIENTS, options):
-        for name, road in ROADS.items():
-            height, v = _height(count, nodes, STEPS, **road)
+        for name, road in reversed(ROADS.items()):
+            if not in_time():
+                print(row(f"{_size(count)}/{nodes}³", name, *[LEFT_OUT] * 3, ""))
+                continue
+            height, start = _height(count, nodes, STEPS, **road)
             runs = {"forward": jax.jit(height), "both": jax.jit(jax.value_and_grad(height))}
-            forward, both = in_turn({key: partial(run, v) for key, run in runs.items()}, windows=7).values()
+            runs = {key: partial(run, *start) for key, run in runs.items()}
+            forward, both = in_turn(runs, windows=7, seconds=3).values()
             times = (f"{1e3 * run.seconds:.2f}" for run in (forward, both))
-            print(row(f"{_size(count)}/{nodes}³", name, *times, f"{both.over(forward):.2f}"))
+            price = both.over(forward)
+            bar = _bar(price <= 4.5, "≤ 4.5") if name == "frames" and on_gpu() else ""
+            print(row(f"{_size(count)}/{nodes}³", name, *times, f"{price:.2f}", bar))
     return None
 
 
@@ -162,38 +198,61 @@ def batch(options):
     """Sixteen simulations together by vmap, against one after another."""
     if not (on_gpu() or options.tiny):
         return NO_GPU
-    count, nodes = _chosen(MATTER, options)[0]
-    print(
-        head(f"simulations of {_size(count)}/{nodes}³, 40 steps", "road", "together ms", "one after another ms", "gain")
-    )
-    for name, road in ROADS.items():
-        height, v = _height(count, nodes, STEPS, **road)
+    (count, nodes), in_time = _chosen(MATTER, options)[0], _clock(options, "batch")
+    simulated = f"simulations of {_size(count)}/{nodes}³, 40 steps"
+    print(head(simulated, "road", "together ms", "one after another ms", "gain", "bar"))
+    for name, road in reversed(ROADS.items()):
+        if not in_time():
+            print(row(16, name, *[LEFT_OUT] * 3, ""))
+            continue
+        height, (v, numbers) = _height(count, nodes, STEPS, **road)
         several = v + jnp.linspace(0, 1, 16)[:, None, None]
-        single, together = jax.jit(height), jax.jit(jax.vmap(height))
-        runs = {"together": partial(together, several), "serial": lambda s=single, v=several: [s(one) for one in v]}
-        vmapped, serial = in_turn(runs, windows=5).values()
+        single, together = jax.jit(height), jax.jit(jax.vmap(height, (0, None)))
+        runs = {
+            "together": partial(together, several, numbers),
+            "serial": lambda s=single, all=several, n=numbers: [s(v, n) for v in all],
+        }
+        vmapped, serial = in_turn(runs, windows=5, seconds=3).values()
         times = (f"{1e3 * run.seconds:.1f}" for run in (vmapped, serial))
-        print(row(16, name, *times, f"{serial.over(vmapped):.2f}"))
+        gain = serial.over(vmapped)
+        bar = _bar(gain >= 8, "≥ 8") if name == "frames" and on_gpu() else ""
+        print(row(16, name, *times, f"{gain:.2f}", bar))
     return None
 
 
 def drawing(options):
     """Forward, and forward and backward, of the ball of splats of `python -m benchmarks render`."""
-    if not on_gpu():
+    if not (on_gpu() or options.tiny):
         return NO_GPU
-    engines = {name: partial(_ours, backend=name) for name in BACKENDS} | ({"splax": _splax} if SPLAX else {})
-    print(head("splats / image", "engine", "forward ms", "forward and backward ms", "compile s", "peak GB"))
-    for count, width, height in _chosen(PICTURES, options):
+    in_time = _clock(options, "drawing")
+    engines = {name: partial(_ours, backend=name) for name in reversed(BACKENDS)}
+    engines = {"warp": engines["warp"]} | ({"splax": _splax} if SPLAX and on_gpu() else {}) | engines
+    print(head("splats / image", "engine", "forward ms", "forward and backward ms", "compile s", "bars", PEAK))
+    for count, width, height in ((300, 64, 48),) if options.tiny else _chosen(PICTURES, options):
         gaussians, camera = ball(count, width, height)
+        of_warp = None
         for name, engine in engines.items():
+            case = f"{_size(count)} / {width}x{height}"
+            if not in_time():
+                print(row(case, name, *[LEFT_OUT] * 3, "", ""))
+                continue
             draw = engine(camera)
-            forward = measure(draw, gaussians, windows=11, seconds=5)
+            forward = measure(draw, gaussians, windows=11, seconds=2)
             both = measure(
-                jax.value_and_grad(lambda g, draw=draw: (draw(g) ** 2).sum()), gaussians, windows=11, seconds=5
+                jax.value_and_grad(lambda g, draw=draw: (draw(g) ** 2).sum()), gaussians, windows=11, seconds=2
             )
             times = (f"{1e3 * run.seconds:.2f}" for run in (forward, both))
             compiled = f"{forward.compile_seconds:.0f} + {both.compile_seconds:.0f}"
-            print(row(f"{count // 1000}k / {width}x{height}", name, *times, compiled, _peak()))
+            bars = ""
+            if name == "warp":
+                of_warp = forward.seconds, both.seconds
+                if count == 1_000_000:
+                    met = forward.seconds <= 4e-3, both.seconds <= 15e-3
+                    bars = f"{_bar(met[0], '≤ 4')}, {_bar(met[1], '≤ 15')}"
+            if name == "splax" and of_warp:
+                met = of_warp[0] <= forward.seconds, of_warp[1] <= both.seconds
+                bars = f"{_bar(met[0], 'warp no slower')}, {_bar(met[1], 'backward too')}"
+            print(row(case, name, *times, compiled, bars, _peak()))
     return None
 
 
@@ -221,26 +280,32 @@ def demo(_):
     from pigjax.cli.scenes import example_folder
     from pigjax.scene import load_scene, run_scene
 
-    print(head("run", "s", "stages, run + compile s"))
+    print(head("run", "s", "bar", "stages, run + compile s"))
     for number in ("first", "second"):
         with tempfile.TemporaryDirectory() as folder:
             begun = time.perf_counter()
             report = run_scene(load_scene(example_folder() / "scene.toml"), Path(folder) / "out")
             stages = ", ".join(f"{name} {spent.run:.1f} + {spent.compile:.1f}" for name, spent in report.times.items())
-            print(row(number, f"{time.perf_counter() - begun:.1f}", stages))
+            seconds = time.perf_counter() - begun
+            print(row(number, f"{seconds:.1f}", _bar(seconds < 6, "< 6") if number == "second" else "", stages))
     return None
 
 
 def training(options):
     """Reconstruction of the bundled tabletop: 30,000 splats, 5,000 steps."""
-    if not on_gpu():
+    if not (on_gpu() or options.tiny):
         return NO_GPU
-    views = load_views(TABLETOP)
-    print(head("backend", "s", "s before step 500", "held-out PSNR dB"))
-    for name in BACKENDS[1:] if options.quick else BACKENDS:
+    in_time, views, took = _clock(options, "training"), load_views(TABLETOP), 0.0
+    steps, splats = (4, 300) if options.tiny else (5000, 30_000)
+    print(head("backend", "s", "s before step 500", "held-out PSNR dB", "bar"))
+    for name in BACKENDS[1:] if options.quick else reversed(BACKENDS):
+        if not in_time(2 * took):  # XLA takes twice as long as Warp
+            print(row(name, *[LEFT_OUT] * 3, ""))
+            continue
         config = FitConfig(
-            steps=5000, splats=30_000, background=1.0, evaluate_every=500, render=RenderConfig(backend=name)
-        )
+            steps=steps, splats=splats, background=1.0, evaluate_every=min(500, steps),
+            render=RenderConfig(backend=name),
+        )  # fmt: skip
         begun, early = time.perf_counter(), []
 
         def tell(progress, early=early):
@@ -248,9 +313,30 @@ def training(options):
                 early.append(progress.seconds)
 
         result = reconstruct(views, config, points=load_points(views.points_path), callback=tell)
-        seconds = time.perf_counter() - begun
-        print(row(name, f"{seconds:.1f}", f"{early[0] if early else seconds:.1f}", f"{result.mean_psnr:.2f}"))
+        took = time.perf_counter() - begun
+        before = f"{early[0] if early else took:.1f}"
+        bar = _bar(took < 25, "< 25") if name == "warp" and on_gpu() else ""
+        print(row(name, f"{took:.1f}", before, f"{result.mean_psnr:.2f}", bar))
     return None
+
+
+def _clock(options, part):
+    """Whether a part has time left of its share, for a number of seconds more."""
+    begun, share = time.perf_counter(), SHARES[part] * options.minutes / sum(SHARES.values()) * 60
+    return lambda more=0.0: time.perf_counter() - begun + more < share or options.tiny
+
+
+def _told(rate, digits):
+    """Millions a second; "" where it is not wanted, None where no time was left."""
+    return rate if rate == "" else LEFT_OUT if rate is None else f"{rate / 1e6:.{digits}f}"
+
+
+def _ratio(ours, other):
+    return f"{ours / other:.2f}" if ours and other else ""
+
+
+def _bar(met, told):
+    return f"{told}: {'met' if met else 'missed'}"
 
 
 def _chosen(cases, options):
@@ -282,6 +368,7 @@ OPTIONS = {
     "quick": {"action": "store_true", "help": "the smaller half of the cases"},
     "tiny": {
         "action": "store_true",
-        "help": "matter, gradient and batch with 400 particles on any device: a rehearsal",
+        "help": "all but the demo with few particles, splats and steps, on any device: a rehearsal",
     },
+    "minutes": {"type": float, "default": 6.0, "help": "for all parts together; rows that do not fit are left out"},
 }

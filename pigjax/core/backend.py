@@ -6,13 +6,17 @@ Warp is imported when a simulation or a drawing first takes it, and never before
 from __future__ import annotations
 
 import functools
+import hashlib
 import importlib.metadata
 import importlib.util
 import os
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
 
 from pigjax.core.errors import InputError
 
@@ -60,9 +64,9 @@ def takes_warp(choice: str, differentiation: str) -> bool:
         return False
     if choice == "auto":
         return _reason_for_xla() is None
-    if not _is_cuda() and jax.default_backend() != "cpu":
+    if not _is_cuda() and _device().platform != "cpu":
         raise InputError(
-            f"backend = 'warp' on a device of kind {jax.default_backend()}: Warp has kernels for CUDA devices and CPUs;"
+            f"backend = 'warp' on a device of kind {_device().platform}: Warp has kernels for CUDA devices and CPUs;"
             ' take backend = "xla" or "auto".'
         )
     return True
@@ -87,7 +91,7 @@ def check_order(warp: bool) -> None:
 
 def backend_in_use() -> str:
     """One line on the backend that "auto" takes on this machine, and why."""
-    device = f"{jax.local_device_count()} x {jax.devices()[0].device_kind}"
+    device = f"{jax.local_device_count()} x {_device().device_kind}"
     reason = _reason_for_xla()
     if reason is None:
         return f"warp {importlib.metadata.version('warp-lang')} on {device}"
@@ -139,6 +143,10 @@ def launcher(kernel: Any, name: str, outputs: int, in_out: tuple[str, ...] = ())
 def caller(function: Any, name: str, outputs: int, in_out: tuple[str, ...] = (), graph_of: tuple[Any, ...] = ()) -> Any:
     """A function of Warp arrays, which launches on the host, as a function of JAX arrays; as `launcher` otherwise.
 
+    A graph is found again by the number of the call and the addresses of its arrays. Addresses recur, so the number
+    stands for the shapes: else the graph of other shapes would be played back. For the same reason a `vmap` becomes a
+    call on longer first axes, whose number stands for the size of the batch too.
+
     Args:
         function: of arrays; it returns nothing.
         name: as of `launcher`.
@@ -150,17 +158,41 @@ def caller(function: Any, name: str, outputs: int, in_out: tuple[str, ...] = (),
     warp = import_warp()
     function.__qualname__ = f"pigjax_{name}"
     modes = warp.JaxCallableGraphMode
-    mode = modes.WARP if graph_of and _is_cuda() else modes.NONE
-    call = warp.jax_callable(function, num_outputs=outputs, graph_mode=mode, in_out_argnames=list(in_out))
 
-    def run(*arrays: Any, **sizes: Any) -> Any:
-        call.call_id = 0
-        for kernel in graph_of if mode == modes.WARP else ():  # no module may be loaded while a graph is recorded
-            for device in jax.local_devices():
-                kernel.module.load(warp.device_from_jax(device))
-        return call(*arrays, **sizes)
+    @functools.cache
+    def call_by(mode: Any) -> Any:
+        return warp.jax_callable(function, num_outputs=outputs, graph_mode=mode, in_out_argnames=list(in_out))
+
+    def run(*arrays: Any, output_dims: Mapping[str, tuple[int, ...]] | None = None) -> Any:
+        @custom_vmap
+        def one(*arrays: Any) -> Any:
+            graphs = bool(graph_of) and _is_cuda()
+            call = call_by(modes.WARP if graphs else modes.NONE)
+            call.call_id = _number_of([array.shape for array in arrays], sorted((output_dims or {}).items()))
+            for kernel in graph_of if graphs else ():  # no module may be loaded while a graph is recorded
+                for device in jax.local_devices():
+                    kernel.module.load(warp.device_from_jax(device))
+            return tuple(call(*arrays, output_dims=output_dims))
+
+        @one.def_vmap
+        def several(size: int, mapped: Any, *arrays: Any) -> Any:
+            each = [
+                array if own else jnp.broadcast_to(array, (size, *array.shape)) for array, own in zip(arrays, mapped)
+            ]
+            longer = [array.reshape(size * array.shape[1], *array.shape[2:]) for array in each]
+            dims = {name: (size * first, *rest) for name, (first, *rest) in (output_dims or {}).items()}
+            found = run(*longer, output_dims=dims or None)
+            split = tuple(part.reshape(size, part.shape[0] // size, *part.shape[1:]) for part in found)
+            return split, (True,) * len(split)
+
+        return one(*arrays)
 
     return run
+
+
+def _number_of(*shapes: Any) -> int:
+    """A number that tells shapes apart and is the same in every process."""
+    return int.from_bytes(hashlib.blake2b(repr(shapes).encode(), digest_size=7).digest(), "big")
 
 
 def _fault_of_installation() -> str | None:
@@ -188,7 +220,13 @@ def _fault_of_driver() -> str | None:
     return None if import_warp().is_cuda_available() else "Warp found no CUDA driver that it can use"
 
 
+def _device() -> jax.Device:
+    """JAX's default device, which a user may have set as a device or as a platform."""
+    chosen = getattr(jax.config, "jax_default_device", None)
+    return jax.devices(chosen)[0] if chosen is None or isinstance(chosen, str) else chosen
+
+
 def _is_cuda() -> bool:
     """Whether JAX's default device is one of NVIDIA's; AMD's are of platform "gpu" too."""
-    device = jax.devices()[0]
+    device = _device()
     return device.platform == "gpu" and "cuda" in device.client.platform_version.lower()

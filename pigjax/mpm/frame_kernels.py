@@ -36,7 +36,30 @@ from pigjax.mpm.frame_types import (
 from pigjax.mpm.transfers import KERNELS
 from pigjax.mpm.warp_kernels import spline_functions
 
-_LARGEST = 2**31 - 1  # bytes from one simulation to the next in Warp's arrays
+_LARGEST = 2**31 - 1  # bytes from one item to the next of an axis of Warp's arrays
+
+
+# Atomics on one place wait for each other. So the threads of a warp that belong to one simulation agree first, by
+# whole numbers that are ordered as the reals (compute capability 8.0 on), and a read tells whether an atomic is needed.
+_EXTREMA = """
+#if defined(__CUDA_ARCH__)
+    SCALAR* at = (SCALAR*)(&wp::index(extrema, b, 0));
+#if FLOAT && __CUDA_ARCH__ >= 800
+    const unsigned live = __activemask(), own = __match_any_sync(live, b);
+    const int bits = __float_as_int(least);
+    const int lowest = __reduce_min_sync(own, bits >= 0 ? bits : bits ^ 0x7fffffff);
+    const int highest = __reduce_max_sync(own, __float_as_int(largest));
+    if ((threadIdx.x & 31) != __ffs(own) - 1) return;
+    least = __int_as_float(lowest >= 0 ? lowest : lowest ^ 0x7fffffff);
+    largest = __int_as_float(highest);
+#endif
+    if (least < at[0]) wp::atomic_min(at, least);
+    if (largest > at[1]) wp::atomic_max(at + 1, largest);
+#else
+    wp::index(extrema, b, 0) = wp::min(wp::index(extrema, b, 0), least);
+    wp::index(extrema, b, 1) = wp::max(wp::index(extrema, b, 1), largest);
+#endif
+"""
 
 
 class FrameKernels(NamedTuple):
@@ -73,6 +96,14 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
     update, update_adjoint = grid_kernels(single)
     inertia, still, infinity, real_name = spline.inverse_inertia, 1e-5, float("inf"), "float" if single else "double"
 
+    def at_least_of_blocks(count):
+        """Options of a kernel of which as many blocks must share a multiprocessor: they bound the registers.
+
+        Else the compiler takes up to 255, of which one block of 256 threads fits. In single precision the bounds hold
+        without spilling but in the rare branch that finds a rotation by turns.
+        """
+        return {"launch_bounds": (256, count)} if single else {}
+
     @kernel
     def copy(source: rows_array, at: int, target: rows_array, to: int):
         b, row, p = wp.tid()
@@ -83,6 +114,9 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
         b = wp.tid()
         extrema[b, 0] = real(wp.static(infinity))
         extrema[b, 1] = real(0.0)
+
+    @wp.func_native(_EXTREMA.replace("SCALAR", real_name).replace("FLOAT", str(int(single))))
+    def note_extrema(extrema: reals2, b: int, least: real, largest: real): ...
 
     @wp.func
     def affine(state: rows_array, slot: int, numbers: reals2, b: int, p: int):
@@ -114,7 +148,7 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
                     value = four(m, at_xy + real(k - 1) * column(slope, 2))
                     add(grid, first + wp.int64((i * ny + j) * nz + k), (wx[i] * wy[j] * wz[k]) * value)
 
-    @kernel
+    @kernel(**at_least_of_blocks(3))
     def gather(
         state: rows_array, slot: int, to: int, step: int, moduli: reals3, law: whole2, numbers: reals2,
         walls_x: whole2, walls_y: whole2, walls_z: whole2, velocity: nodes_array, extrema: reals2, counts: whole3,
@@ -151,11 +185,7 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
 
         J, speed, total = wp.determinant(f), wp.dot(v, v), m + volume
         if volume > real(0.0) and not wp.isnan(J) and not wp.isnan(speed):
-            # a read first: few particles are the extreme one, and atomics on one place wait for each other
-            if J < extrema[b, 0]:
-                wp.atomic_min(extrema, b, 0, J)
-            if speed > extrema[b, 1]:
-                wp.atomic_max(extrema, b, 1, speed)
+            note_extrema(extrema, b, J, speed)
             if J <= real(0.0):
                 wp.atomic_add(counts, b, step, 1, 1)
             out, hit = int(0), int(0)
@@ -190,7 +220,7 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
         state[b, to, wp.static(MASS), p] = m
         state[b, to, wp.static(VOLUME), p] = volume
 
-    @kernel
+    @kernel(**at_least_of_blocks(2))
     def gather_adjoint(
         state: rows_array, slot: int, moduli: reals3, law: whole2, numbers: reals2, walls_x: whole2,
         walls_y: whole2, walls_z: whole2, velocity: nodes_array, cotangent: nodes_array, of_state: rows_array,
@@ -313,19 +343,23 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
                 device=places,
             )
 
-    def start(state, extrema, *cleared):
-        if state.shape[0] > 1 and state.strides[0] > _LARGEST:
-            raise ValueError("simulations of more than 2 GiB each are not batched: map them one by one (lax.map)")
+    def start(extrema, cleared, *others):
+        for array in (*cleared, *others):
+            if any(items > 1 and stride > _LARGEST for items, stride in zip(array.shape, array.strides)):
+                raise ValueError(
+                    f"an array {array.shape} of whole frames has more than 2 GiB from one simulation or state to the"
+                    " next: map simulations one by one (lax.map), or take SimConfig(whole_frames=False)"
+                )
         for array in cleared:
             array.zero_()
-        wp.launch(begin, state.shape[0], [extrema], device=state.device)
+        wp.launch(begin, extrema.shape[0], [extrema], device=extrema.device)
 
     def run(
         state: rows_array, moduli: reals3, law: whole2, numbers: reals2, modes: whole2, walls_x: whole2,
         walls_y: whole2, walls_z: whole2, contact: rows_array, grid: nodes_array, velocity: nodes_array,
         extrema: reals2, counts: whole3, sides: whole2,
     ):  # fmt: skip
-        start(state, extrema, grid, counts, sides)
+        start(extrema, (grid, counts, sides), state, contact)
         slots = [(step, 0, 0, 0, 1) for step in range(counts.shape[1])]
         walls = (walls_x, walls_y, walls_z)
         forward(state, moduli, law, numbers, modes, walls, contact, grid, velocity, extrema, counts, sides, slots)
@@ -335,7 +369,7 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
         walls_y: whole2, walls_z: whole2, contact: rows_array, grid: nodes_array, velocity: nodes_array,
         extrema: reals2, counts: whole3, sides: whole2, kept: rows_array,
     ):  # fmt: skip
-        start(state, extrema, grid, counts, sides)
+        start(extrema, (grid, counts, sides), state, contact, kept)
         walls, dims = (walls_x, walls_y, walls_z), (state.shape[0], ROWS, state.shape[3])
         for number, (low, high) in enumerate(blocks_of(counts.shape[1], kept.shape[1])):
             wp.launch(copy, dims, [state, 0, kept, number], device=state.device)
@@ -349,7 +383,8 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
         grids: nodes_array, velocity: nodes_array, cotangent: nodes_array, extrema: reals2, counts: whole3,
         sides: whole2,
     ):  # fmt: skip
-        start(states, extrema, of_moduli, of_sizes, of_gravity, of_contact, of_friction, counts, sides)
+        cleared = of_moduli, of_sizes, of_gravity, of_contact, of_friction, counts, sides
+        start(extrema, cleared, states, kept, contact, grids)
         walls, device = (walls_x, walls_y, walls_z), states.device
         particles, all_nodes = (states.shape[0], states.shape[3]), (grids.shape[0], grids.shape[2])
         dims, blocks = (states.shape[0], ROWS, states.shape[3]), blocks_of(counts.shape[1], kept.shape[1])

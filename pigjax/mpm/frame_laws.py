@@ -57,8 +57,9 @@ def frame_laws(single: bool) -> tuple[Any, Any]:
         a, v = f, wp.identity(n=3, dtype=real)
         if largest > real(0.0):
             a = f / largest
-        for _ in range(wp.static(sweeps)):
-            for pair in range(3):
+        rounds, pairs = int(wp.static(sweeps)), int(3)  # variables: these loops are not unrolled, for they run rarely
+        for _ in range(rounds):
+            for pair in range(pairs):
                 i, j = int(0), int(1)
                 if pair == 1:
                     j = int(2)

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from pigjax.core.errors import InputError
 from pigjax.mpm import WALL, State, StepHealth
 from pigjax.mpm.boundaries import places_of
 from pigjax.mpm.colliders import Collider
@@ -120,8 +121,15 @@ def whole_frames(
         states: of each law [p r], for their numbers of particles and rows of the material table.
         steps: of a frame.
         block: steps of a block.
+
+    Raises:
+        InputError: the grid has more nodes than 32 bits count.
     """
     dtype = context.dt.dtype
+    if math.prod(context.grid.shape) > np.iinfo(np.int32).max:
+        raise InputError(
+            f"a grid of {context.grid.shape} nodes is too large to be held at once: give SimConfig(box=...)."
+        )
     room = np.iinfo(np.int32).max // (ROWS * np.dtype(dtype).itemsize * sum(len(state.cells) for state in states))
     block = min(block, max(1, room - 1))  # strides of Warp's arrays have 32 bits
     frame = _Frame(len(statics.kernel.offsets), context.grid.shape, steps, -(-steps // block))

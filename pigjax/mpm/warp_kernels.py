@@ -136,25 +136,31 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
     unrolled = {"max_unroll": 1 if jax.default_backend() == "cpu" else 16}
     kernel = functools.partial(wp.kernel, module="unique", enable_backward=False, module_options=unrolled)
 
+    # indices of 64 bits: a batch of simulations may have more nodes and particles than 32 bits count
     @wp.func_native(text(ADD))
-    def add(grid: wp.array4d(dtype=vec4), node: int, value: vec4): ...
+    def add(grid: wp.array4d(dtype=vec4), node: wp.int64, value: vec4): ...
 
     @wp.func_native(text(READ))
-    def read(grid: wp.array4d(dtype=vec4), node: int) -> vec4: ...
+    def read(grid: wp.array4d(dtype=vec4), node: wp.int64) -> vec4: ...
 
     @wp.func_native(text(_LOAD))
-    def load(rows: wp.array2d(dtype=vec4), at: int) -> vec4: ...
+    def load(rows: wp.array2d(dtype=vec4), at: wp.int64) -> vec4: ...
 
     @wp.func_native(text(_STORE))
-    def store(rows: wp.array2d(dtype=vec4), at: int, value: vec4): ...
+    def store(rows: wp.array2d(dtype=vec4), at: wp.int64, value: vec4): ...
 
     weights, slopes, anchor = spline_functions(nodes, nearest, single)
 
     @wp.func
     def first_node(grid: wp.array4d(dtype=vec4), b: int, x: int, y: int, z: int):
         """Flat index of the first node of the window whose node at offset 0 is at x, y, z."""
-        low = wp.static(first_offset)
-        return ((b * grid.shape[1] + x + low) * grid.shape[2] + y + low) * grid.shape[3] + z + low
+        low, nodes_of = wp.static(first_offset), grid.shape[1] * grid.shape[2] * grid.shape[3]
+        own = ((x + low) * grid.shape[2] + y + low) * grid.shape[3] + z + low
+        return wp.int64(b) * wp.int64(nodes_of) + wp.int64(own)
+
+    @wp.func
+    def row_at(cells: wp.array2d(dtype=vec3), b: int, p: int):
+        return wp.int64(b) * wp.int64(cells.shape[1]) + wp.int64(p)
 
     @kernel
     def scatter(
@@ -166,7 +172,7 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
         x, y, z = anchor(cell[0], grid.shape[1]), anchor(cell[1], grid.shape[2]), anchor(cell[2], grid.shape[3])
         wx, wy, wz = weights(cell[0] - real(x)), weights(cell[1] - real(y)), weights(cell[2] - real(z))
         node, row, plane = first_node(grid, b, x, y, z), grid.shape[3], grid.shape[2] * grid.shape[3]
-        row_of = b * cells.shape[1] + p
+        row_of = row_at(cells, b, p)
         p0, px, py, pz = load(constant, row_of), load(slope_x, row_of), load(slope_y, row_of), load(slope_z, row_of)
         for i in range(wp.static(nodes)):
             at_x = p0 + real(wp.static(first_offset) + i) * px
@@ -174,7 +180,7 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
                 at_xy, w = at_x + real(wp.static(first_offset) + j) * py, wx[i] * wy[j]
                 for k in range(wp.static(nodes)):
                     value = (w * wz[k]) * (at_xy + real(wp.static(first_offset) + k) * pz)
-                    add(grid, node + i * plane + j * row + k, value)
+                    add(grid, node + wp.int64(i * plane + j * row + k), value)
 
     @kernel
     def gather(
@@ -187,14 +193,14 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
         x, y, z = anchor(cell[0], grid.shape[1]), anchor(cell[1], grid.shape[2]), anchor(cell[2], grid.shape[3])
         wx, wy, wz = weights(cell[0] - real(x)), weights(cell[1] - real(y)), weights(cell[2] - real(z))
         node, row, plane = first_node(grid, b, x, y, z), grid.shape[3], grid.shape[2] * grid.shape[3]
-        row_of = b * cells.shape[1] + p
+        row_of = row_at(cells, b, p)
         m0, mx, my, mz = vec4(), vec4(), vec4(), vec4()
         for i in range(wp.static(nodes)):
             s0, sy, sz = vec4(), vec4(), vec4()  # of the plane
             for j in range(wp.static(nodes)):
                 r0 = vec4()  # of the row
                 for k in range(wp.static(nodes)):
-                    u = wz[k] * read(grid, node + i * plane + j * row + k)
+                    u = wz[k] * read(grid, node + wp.int64(i * plane + j * row + k))
                     r0 += u
                     sz += (wy[j] * real(wp.static(first_offset) + k)) * u
                 s0 += wy[j] * r0
@@ -221,7 +227,7 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
         dx, dy, dz = cell[0] - real(x), cell[1] - real(y), cell[2] - real(z)
         wx, wy, wz, sx, sy, sz = weights(dx), weights(dy), weights(dz), slopes(dx), slopes(dy), slopes(dz)
         node, row, plane = first_node(grid, b, x, y, z), grid.shape[3], grid.shape[2] * grid.shape[3]
-        row_of = b * cells.shape[1] + p
+        row_of = row_at(cells, b, p)
         q0, qx, qy, qz = load(p0, row_of), load(px, row_of), load(py, row_of), load(pz, row_of)
         m0, mx, my, mz, slope = vec4(), vec4(), vec4(), vec4(), vec3()
         for i in range(wp.static(nodes)):
@@ -230,7 +236,7 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
                 at_xy = at_x + real(wp.static(first_offset) + j) * qy
                 r0, rz, even, along = vec4(), vec4(), real(0.0), real(0.0)  # of the row
                 for k in range(wp.static(nodes)):
-                    u = read(grid, node + i * plane + j * row + k)
+                    u = read(grid, node + wp.int64(i * plane + j * row + k))
                     product = wp.dot(u, at_xy + real(wp.static(first_offset) + k) * qz)
                     r0 += wz[k] * u
                     rz += (wz[k] * real(wp.static(first_offset) + k)) * u
@@ -260,7 +266,7 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
         dx, dy, dz = cell[0] - real(x), cell[1] - real(y), cell[2] - real(z)
         wx, wy, wz, sx, sy, sz = weights(dx), weights(dy), weights(dz), slopes(dx), slopes(dy), slopes(dz)
         node, row, plane = first_node(grid, b, x, y, z), grid.shape[3], grid.shape[2] * grid.shape[3]
-        row_of, slope = b * cells.shape[1] + p, vec3()
+        row_of, slope = row_at(cells, b, p), vec3()
         q0, qx, qy, qz = load(p0, row_of), load(px, row_of), load(py, row_of), load(pz, row_of)
         for i in range(wp.static(nodes)):
             at_x = q0 + real(wp.static(first_offset) + i) * qx
@@ -268,7 +274,7 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
                 at_xy, w = at_x + real(wp.static(first_offset) + j) * qy, wx[i] * wy[j]
                 even, along = real(0.0), real(0.0)  # of the row
                 for k in range(wp.static(nodes)):
-                    at = node + i * plane + j * row + k
+                    at = node + wp.int64(i * plane + j * row + k)
                     cotangent = at_xy + real(wp.static(first_offset) + k) * qz
                     product = wp.dot(read(grid, at), cotangent)
                     even += wz[k] * product

@@ -151,7 +151,9 @@ def tile_boxes(projected: Projected, config: BlendConfig) -> tuple[Int[Array, "n
 
 def rows_in_order(projected: Projected, boxes: Boxes, *features: Float[Array, "n _"]) -> Float[Array, "n f"]:
     """Rows that tiles composite, front to back: shape columns, then features."""
-    return jnp.concatenate([projected.shapes, *features], 1)[boxes.order]
+    rows = jnp.concatenate([projected.shapes, *features], 1)
+    # the transpose of a permutation needs no atomics
+    return rows.at[boxes.order].get(unique_indices=True, mode="promise_in_bounds")
 
 
 def untile(planes: Float[Array, "tiles c pixels"], config: BlendConfig) -> Float[Array, "h w c"]:
@@ -210,8 +212,7 @@ def list_pass(
         everywhere = jnp.ones(config.tiles, bool) if open_tiles is None else open_tiles
         box = boxes.low, boxes.size
         settings = (config.columns, config.tile), _least_exponent(config)
-        rank, tile = slots_by_tile(shapes, *box, ends, end - pairs, everywhere, *settings, slots)
-        start = jnp.searchsorted(tile, jnp.arange(config.tiles + 1, dtype=jnp.int32)).astype(jnp.int32)
+        rank, tile, start = slots_by_tile(shapes, *box, ends, end - pairs, everywhere, *settings, slots)
         return TileLists(rank, tile, start, following, listed)
 
     slot = jnp.arange(slots, dtype=jnp.int32)

@@ -1,12 +1,14 @@
 """Contributions of single splats to a pixel: a soft surface depth, and the alpha·T of each splat in chosen pixels.
 
 Both scan the lists with the static length of `scan_compositor`, which forward and reverse mode differentiate as it
-stands. `compositor` is faster and has a hand-written backward pass, but gives only sums over splats.
+stands. `compositor` is faster and has a hand-written backward pass, but gives only sums over splats. By Warp kernels
+(`RenderConfig.backend`) both walk the lists of the compositor instead.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -45,7 +47,8 @@ def soft_surface_depth(
     With c(T) = sigmoid((tau_T - T) / temperature), splat i has the share c(T after i) - c(T before i) of the surface:
     the probability that the transmittance crosses a threshold drawn around tau_T at that splat. The depth is the mean
     under these shares. As the temperature falls to 0, depth and presence tend to the hard pick. Differentiable in
-    forward and reverse mode with respect to every float argument.
+    forward and reverse mode with respect to every float argument; by Warp kernels in reverse mode, once, and then
+    without a static capacity unless `config` has one.
 
     Args:
         splats: the scene.
@@ -58,10 +61,18 @@ def soft_surface_depth(
         Camera z of the surface [m], 1 where there is none; the probability that there is one, 0 to 1; and the
         splat/tile pairs dropped for want of capacity.
     """
-    chunks, blending, overflow = _chunks_of(splats, camera, config)
 
     def passed(transmittance):
         return jax.nn.sigmoid((tau_T - transmittance) / temperature)
+
+    if len(splats) == 0:
+        none = jnp.zeros((camera.height, camera.width), splats.means.dtype)
+        return none + 1.0, none, jnp.zeros((), jnp.int32)
+    blending = blend_config(camera, config, len(splats), surface=True)
+    if blending.warp:
+        depth, last, overflow = _soft_surface_by_warp(splats, camera, config, blending, tau_T, temperature)
+        return *_surface(depth, passed(last) - passed(1.0), passed), overflow
+    chunks, blending, overflow = _chunks_of(splats, camera, config)
 
     def shares(chunk: Chunks, alpha, blend: Blend):
         share = jnp.where(may_be_surface(blend, blending), passed(blend.after) - passed(blend.before), 0.0)
@@ -69,10 +80,16 @@ def soft_surface_depth(
 
     parts = scan_chunks(chunks, jnp.any(chunks.valid, 1), blending, shares)
     image = untile(jax.ops.segment_sum(parts, chunks.tile, blending.tiles), blending)
-    depth, presence = image[..., 0], image[..., 1]
+    return *_surface(image[..., 0], image[..., 1], passed), overflow
+
+
+def _surface(
+    depth: Float[Array, "h w"], presence: Float[Array, "h w"], passed: Callable
+) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+    """Mean depth and probability of a surface, from the sums over splats of shares with and without the depth."""
     there = presence > _LEAST_PRESENCE
     depth = jnp.where(there, depth / jnp.where(there, presence, 1.0), 1.0)
-    return depth, jnp.where(there, presence / (1 - passed(1.0)), 0.0), overflow
+    return depth, jnp.where(there, presence / (1 - passed(1.0)), 0.0)
 
 
 def credits_of_candidates(
@@ -94,6 +111,8 @@ def credits_of_candidates(
         mask: id of each pixel.
         candidates: ids of each splat; a candidate of -1 gets nothing.
     """
+    if len(splats) == 0:
+        return jnp.zeros(candidates.shape, splats.means.dtype)
     blending = blend_config(camera, config, len(splats), surface=True)
     if blending.warp:
         return _credits_by_warp(splats, camera, config, blending, mask, candidates)
@@ -110,6 +129,26 @@ def credits_of_candidates(
     parts = scan_chunks(chunks, index <= last_asked[chunks.tile], blending, credit)
     credits = jnp.zeros(candidates.shape, parts.dtype)
     return credits.at[chunks.splat].add(jnp.where(asked, parts, 0.0))
+
+
+def _soft_surface_by_warp(
+    splats: Splats,
+    camera: Camera,
+    config: RenderConfig,
+    blending: BlendConfig,
+    tau_T: Float[Array, ""] | float,
+    temperature: Float[Array, ""] | float,
+) -> tuple[Float[Array, "h w"], Float[Array, "h w"], Int[Array, ""]]:
+    """By kernels that walk the lists of the compositor: sum of depth times share, and the last transmittance."""
+    from pigjax.splatting.warp_compositor import soft_surface_by_warp
+
+    projected = project_splats(splats, camera, config)
+    boxes = bin_splats(projected, blending)
+    table = rows_in_order(projected, boxes, projected.depths[:, None])
+    numbers = jnp.asarray(tau_T, table.dtype), jnp.asarray(temperature, table.dtype)
+    *planes, overflow = soft_surface_by_warp(table, boxes, *numbers, blending)
+    image = untile(jnp.stack(planes, 1), blending)
+    return image[..., 0], image[..., 1], overflow
 
 
 def _credits_by_warp(

@@ -6,7 +6,6 @@ keys have the bits of a tile's number, where keys of tile and slot would need 64
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -24,8 +23,8 @@ def slots_by_tile(
     grid: tuple[int, int],
     least_exponent: float,
     slots: int,
-) -> tuple[Int[Array, "slots"], Int[Array, "slots"]]:
-    """Rank and tile of each slot, sorted by tile and then by rank; nothing here is differentiated.
+) -> tuple[Int[Array, "slots"], Int[Array, "slots"], Int[Array, "tiles_plus_1"]]:
+    """The lists of a pass, sorted by tile and then by rank; nothing here is differentiated.
 
     Args:
         shapes: shape columns, front to back.
@@ -39,15 +38,19 @@ def slots_by_tile(
         slots: static size of the pass.
 
     Returns:
-        Rank and tile; the tile equals the number of tiles in slots that no tile owns.
+        Rank and tile, and the first slot of each tile and of what no tile owns; the tile equals the number of tiles in
+        slots that no tile owns.
     """
     shapes = lax.stop_gradient(shapes)
     tiles, dtype = len(open_tiles), shapes.dtype
     limits = jnp.full((1, 4), least_exponent, dtype)
-    empty = jnp.zeros((1, 2 * slots), jnp.int32)
-    arrays = (shapes, low, size, end, before, open_tiles.astype(jnp.int32))
+    empty, is_open = jnp.zeros((1, 2 * slots), jnp.int32), open_tiles.astype(jnp.int32)[None]
+    arrays = (shapes, low, size, end, before)
     kernels = list_kernels(dtype == jnp.float32)
     # a batch gives all of these arrays its axis, which a launch reads from the first
-    tile, rank = kernels.slots(empty, empty, *(a[None] for a in arrays), limits, jnp.asarray([grid], jnp.int32))
-    tile, rank = radix_sort()(tile, rank, jnp.zeros((1, tiles + 1), jnp.int32))
-    return jax.tree.map(lambda part: part[0, :slots], (rank, tile))
+    sizes = jnp.asarray([grid], jnp.int32)
+    buffers = kernels.slots(empty, empty, *(a[None] for a in arrays), is_open, limits, sizes)
+    buffers = radix_sort()(*buffers, is_open)
+    dims = {"tile": (1, slots), "rank": (1, slots), "start": (1, tiles + 1)}
+    tile, rank, start = kernels.lists(*buffers, is_open, output_dims=dims)
+    return rank[0], tile[0], start[0]

@@ -24,7 +24,7 @@ from pigjax.splatting.binning import (
     run_passes,
 )
 from pigjax.splatting.types import Projected
-from pigjax.splatting.warp_kernels import QUADS, blend_kernels, list_kernels
+from pigjax.splatting.warp_kernels import QUADS, blend_kernels, list_kernels, surface_kernels
 
 _WIDEST = 4  # groups of four channels whose sums stay in registers
 
@@ -109,6 +109,77 @@ def _composite_bwd(config: BlendConfig, saved: Any, cotangents: Any) -> tuple[Fl
 composite_by_warp.defvjp(_composite_fwd, _composite_bwd)
 
 
+@functools.partial(jax.custom_vjp, nondiff_argnums=(4,))
+def soft_surface_by_warp(
+    table: Float[Array, "n 7"], boxes: Boxes, tau: Float[Array, ""], temperature: Float[Array, ""], config: BlendConfig
+) -> tuple[Float[Array, "tiles p"], Float[Array, "tiles p"], Int[Array, ""]]:
+    """Sums behind `contributions.soft_surface_depth`, whose scan is the oracle. Reverse mode once.
+
+    Residuals: the arguments and three planes.
+
+    Args:
+        table: rows of `binning.rows_in_order`: shape columns and depth.
+        boxes: of `binning.bin_splats`.
+        tau: transmittance at which the surface lies.
+        temperature: width of the sigmoid.
+        config: static settings.
+
+    Returns:
+        Sum of each splat's depth times its share of the surface, the transmittance behind all splats, and the
+        splat/tile pairs that the capacity left out.
+    """
+    sums, last, overflow = _soft_sums(table, boxes, tau, temperature, config)
+    return sums[..., 0], last, overflow
+
+
+def _soft_sums(
+    table: Float[Array, "n 7"], boxes: Boxes, tau: Float[Array, ""], temperature: Float[Array, ""], config: BlendConfig
+) -> tuple[Float[Array, "tiles p 4"], Float[Array, "tiles p"], Int[Array, ""]]:
+    """The sums of `SurfaceKernels.forward`."""
+    dtype, rows, plane = table.dtype, _rows_with_depth(table), (config.tiles, config.tile**2)
+    settings = *_settings(tau, config, dtype), temperature.astype(dtype)[None]
+    kernel = surface_kernels(dtype == jnp.float32).forward
+
+    def visit(lists, state):
+        after, sums = kernel(state[0][None], state[1], rows, *_of(lists), *settings)
+        return after[0], sums
+
+    start = jnp.ones(plane, dtype), jnp.zeros((1, *plane, 4), dtype)
+    (last, sums), overflow = run_passes(table, boxes, config, start, visit)
+    return sums[0], last, overflow
+
+
+def _soft_fwd(
+    table: Float[Array, "n 7"], boxes: Boxes, tau: Float[Array, ""], temperature: Float[Array, ""], config: BlendConfig
+) -> Any:
+    sums, last, overflow = _soft_sums(table, boxes, tau, temperature, config)
+    return (sums[..., 0], last, overflow), (table, boxes, tau, temperature, sums[..., 1:], last)
+
+
+def _soft_bwd(config: BlendConfig, saved: Any, cotangents: Any) -> tuple[Float[Array, "n 7"], Any, Any, Any]:
+    table, boxes, tau, temperature, sums, last = saved
+    dtype, rows, plane = table.dtype, _rows_with_depth(table), (1, config.tiles, config.tile**2)
+    of_depth, of_last = cotangents[0][None], (cotangents[1] * last)[None]
+    settings = *_settings(tau, config, dtype), temperature.astype(dtype)[None]
+    kernel = surface_kernels(dtype == jnp.float32).adjoint
+
+    def visit(lists, state):
+        after, *rest = kernel(
+            state[0][None], *state[1:], sums[None, ..., 0], of_depth, of_last, rows, *_of(lists), *settings
+        )
+        return after[0], *rest
+
+    start = jnp.ones(plane[1:], dtype), jnp.zeros(plane, dtype), jnp.zeros_like(rows)
+    (_, _, of_rows), _ = run_passes(table, boxes, config, start, visit)
+    by_tau, by_width = (jnp.sum(cotangents[0] * sums[..., k]) / temperature for k in (1, 2))
+    no_cotangent = jax.tree.map(lambda index: np.zeros(index.shape, jax.dtypes.float0), boxes)
+    flat = of_rows.reshape(len(table), -1)[:, : table.shape[1]]
+    return flat, no_cotangent, by_tau.astype(tau.dtype), -by_width.astype(temperature.dtype)
+
+
+soft_surface_by_warp.defvjp(_soft_fwd, _soft_bwd)
+
+
 def credits_by_warp(
     projected: Projected,
     boxes: Boxes,
@@ -128,7 +199,7 @@ def credits_by_warp(
         config: static settings.
     """
     table = rows_in_order(projected, boxes)
-    rows = _shapes(table, jnp.zeros_like(table[:, :1])).reshape(1, -1, QUADS, 4)
+    rows = _shapes(table, jnp.zeros_like(table[:, :1]))
     settings = _settings(jnp.zeros((), table.dtype), config, table.dtype)
     asked = candidates.astype(jnp.int32)[boxes.order]
     credits = jnp.zeros((1, *candidates.shape), table.dtype)
@@ -166,8 +237,7 @@ def _packed(table: Float[Array, "n f"], config: BlendConfig) -> list[Float[Array
         part = channels[:, first : first + 4 * _WIDEST]
         width = _width(part.shape[1])
         part = jnp.pad(part, ((0, 0), (0, 4 * width - part.shape[1])))
-        rows = jnp.concatenate([_shapes(table, depth), part], 1)
-        groups.append(rows.reshape(1, count, QUADS + width, 4))
+        groups.append(jnp.concatenate([_shapes(table, depth), part.reshape(1, count, width, 4)], 2))
     return groups
 
 
@@ -176,8 +246,13 @@ def _width(channels: int) -> int:
     return next(width for width in (1, 2, _WIDEST) if channels <= 4 * width)
 
 
-def _shapes(table: Float[Array, "n f"], depth: Float[Array, "n 1"]) -> Float[Array, "n 8"]:
-    return jnp.concatenate([table[:, :SHAPE_COLUMNS], depth, jnp.zeros_like(depth)], 1)
+def _shapes(table: Float[Array, "n f"], depth: Float[Array, "n 1"]) -> Float[Array, "1 n 2 4"]:
+    rows = jnp.concatenate([table[:, :SHAPE_COLUMNS], depth, jnp.zeros_like(depth)], 1)
+    return rows.reshape(1, len(table), QUADS, 4)
+
+
+def _rows_with_depth(table: Float[Array, "n 7"]) -> Float[Array, "1 n q 4"]:
+    return _shapes(table, table[:, SHAPE_COLUMNS:])
 
 
 def _unpacked(

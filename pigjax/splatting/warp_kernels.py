@@ -28,11 +28,27 @@ class BlendKernels(NamedTuple):
     adjoint: Any
 
 
-class ListKernels(NamedTuple):
-    """The kernels that need no channels."""
+class SurfaceKernels(NamedTuple):
+    """The kernels of the soft surface depth; rows have the shape and the depth alone."""
 
-    # (tile, rank, shapes, low, size, end, before, open, limits, sizes) -> the first two, in twice as many slots
+    # (transmittance, sums, rows, rank, start, limits, sizes, widths) -> the first two; sums of z times what a splat
+    # changes of c, of c'(T) T, and of the derivatives of c by tau and by the width, both times the width
+    forward: Any
+    # (transmittance, prefix, rows' cotangent, sum of c'(T) T, cotangents of the depth and of the last transmittance,
+    # both times what they belong to: 1 and that transmittance, rows, rank, start, limits, sizes, widths) -> first three
+    adjoint: Any
+
+
+_SORTED_AT_ONCE = 2**30  # slots, and values of their keys, of the images that are sorted together
+
+
+class ListKernels(NamedTuple):
+    """The kernels that need no channels. Buffers have twice the slots of a pass; see `radix_sort`."""
+
+    # (keys, ranks, shapes, low, size, end, before, open, limits, sizes) -> the first two
     slots: Any
+    # (sorted keys, ranks, open) -> tile and rank of each slot, and the first slot of each tile
+    lists: Any
     # (credits, rows, rank, start, candidates, ids, limits, sizes) -> credits; the pixels are those of ids
     credit: Any
 
@@ -45,11 +61,12 @@ _ANY = """
     return flag;
 #endif
 """
+# A value's numbers beyond those that are filled are 0 in every thread.
 _ADD = """
 #if defined(__CUDA_ARCH__)
     SCALAR v[4] = {value[0], value[1], value[2], value[3]};
     if (whole) {
-        for (int k = 0; k < 4; ++k)
+        for (int k = 0; k < filled; ++k)
             for (int o = 16; o > 0; o /= 2) v[k] += __shfl_xor_sync(0xffffffffu, v[k], o);
         if ((threadIdx.x & 31) != 0) return;
     }
@@ -85,17 +102,23 @@ def _tools(wp: Any, single: bool) -> Any:
     @wp.func_native(_ANY)
     def any_of_warp(flag: int, whole: int) -> int: ...
 
+    # indices of 64 bits: the images of a batch may have more rows than 32 bits count
     @wp.func_native(text(_ADD))
-    def add(sums: wp.array3d(dtype=vec4), at: int, value: vec4, whole: int): ...
+    def add(sums: wp.array3d(dtype=vec4), at: wp.int64, value: vec4, filled: int, whole: int): ...
 
     @wp.func_native(text(_READ))
-    def read(rows: wp.array3d(dtype=vec4), at: int) -> vec4: ...
+    def read(rows: wp.array3d(dtype=vec4), at: wp.int64) -> vec4: ...
 
     @wp.func
     def pixel_centre(tile: int, pixel: int, columns: int, edge: int):
         x = real(tile % columns * edge + pixel % edge) + real(0.5)
         y = real(tile // columns * edge + pixel // edge) + real(0.5)
         return vec2(x, y)
+
+    @wp.func
+    def row_of(rows: wp.array3d(dtype=vec4), b: int, splat: int):
+        """Index of the first word of a splat's row."""
+        return (wp.int64(b) * wp.int64(rows.shape[1]) + wp.int64(splat)) * wp.int64(rows.shape[2])
 
     @wp.func
     def opacity(first: vec4, second: vec4, u: real, v: real):
@@ -106,7 +129,7 @@ def _tools(wp: Any, single: bool) -> Any:
     # unrolled loops take long to compile; a CPU gains little from them
     unrolled = {"max_unroll": 1 if jax.default_backend() == "cpu" else 16}
     kernel = functools.partial(wp.kernel, module="unique", enable_backward=False, module_options=unrolled)
-    return kernel, real, vec4, any_of_warp, add, read, pixel_centre, opacity
+    return kernel, real, vec4, any_of_warp, add, read, row_of, pixel_centre, opacity
 
 
 @functools.cache
@@ -119,9 +142,8 @@ def blend_kernels(channels: int, single: bool) -> BlendKernels:
         single: float32, else float64.
     """
     wp = import_warp()
-    kernel, real, vec4, any_of_warp, add, read, pixel_centre, opacity = _tools(wp, single)
+    kernel, real, vec4, any_of_warp, add, read, row_of, pixel_centre, opacity = _tools(wp, single)
     sums_of = wp.types.matrix(shape=(channels, 4), dtype=real)
-    width = channels + QUADS
 
     @kernel
     def blend(
@@ -139,14 +161,14 @@ def blend_kernels(channels: int, single: bool) -> BlendKernels:
         for s in range(start[b, tile], start[b, tile + 1]):
             if through <= least:
                 break
-            row = (b * rows.shape[1] + rank[b, s]) * wp.static(width)
-            first, second = read(rows, row), read(rows, row + 1)
+            row = row_of(rows, b, rank[b, s])
+            first, second = read(rows, row), read(rows, row + wp.int64(1))
             alpha = wp.min(opacity(first, second, at[0] - first[0], at[1] - first[1]), alpha_max)
             if alpha >= alpha_min:
                 weight = alpha * through
                 if through - weight > least:
                     for q in range(wp.static(channels)):
-                        total[q] = total[q] + weight * read(rows, row + wp.static(QUADS) + q)
+                        total[q] = total[q] + weight * read(rows, row + wp.int64(wp.static(QUADS) + q))
                 after = through * (real(1.0) - alpha)
                 if through >= tau and after < tau:
                     picked += second[2]
@@ -179,8 +201,8 @@ def blend_kernels(channels: int, single: bool) -> BlendKernels:
                 is_open = 1
             if any_of_warp(is_open, whole) == 0:
                 break
-            row = (b * rows.shape[1] + rank[b, s]) * wp.static(width)
-            first, second = read(rows, row), read(rows, row + 1)
+            row = row_of(rows, b, rank[b, s])
+            first, second = read(rows, row), read(rows, row + wp.int64(1))
             u, v = at[0] - first[0], at[1] - first[1]
             unclamped = opacity(first, second, u, v)
             alpha = wp.min(unclamped, alpha_max)
@@ -195,7 +217,7 @@ def blend_kernels(channels: int, single: bool) -> BlendKernels:
                     seen = 1
                     gain = real(0.0)
                     for q in range(wp.static(channels)):
-                        gain += wp.dot(cotangent[q], read(rows, row + wp.static(QUADS) + q))
+                        gain += wp.dot(cotangent[q], read(rows, row + wp.int64(wp.static(QUADS) + q)))
                     passed += weight * gain
                     if unclamped < alpha_max:
                         slope = weight * gain - (sum_ - passed) * (alpha / (real(1.0) - alpha))
@@ -205,10 +227,10 @@ def blend_kernels(channels: int, single: bool) -> BlendKernels:
                 by_place = vec4(
                     slope * (a * u + first[3] * v), slope * (c * v + first[3] * u), -half * u * u, -slope * u * v
                 )
-                add(of_rows, row, by_place, whole)
-                add(of_rows, row + 1, vec4(-half * v * v, slope, pick, real(0.0)), whole)
+                add(of_rows, row, by_place, 4, whole)
+                add(of_rows, row + wp.int64(1), vec4(-half * v * v, slope, pick, real(0.0)), 3, whole)
                 for q in range(wp.static(channels)):
-                    add(of_rows, row + wp.static(QUADS) + q, weight * cotangent[q], whole)
+                    add(of_rows, row + wp.int64(wp.static(QUADS) + q), weight * cotangent[q], 4, whole)
         transmittance[b, tile, pixel] = through
         prefix[b, tile, pixel] = passed
 
@@ -221,11 +243,126 @@ def blend_kernels(channels: int, single: bool) -> BlendKernels:
 
 @functools.cache
 @no_type_check
+def surface_kernels(single: bool) -> SurfaceKernels:
+    """Kernels of the soft surface depth of `contributions`, in single or double precision.
+
+    With c the sigmoid of (tau - T) / width, the sum over splats of z (c(T behind) - c(T in front)) has the derivative
+    c'(T) (z of the splat before - z of the splat behind) by the transmittance between two splats, and each
+    transmittance falls by T / (1 - alpha) with the alpha of every splat in front of it.
+    """
+    wp = import_warp()
+    kernel, real, vec4, any_of_warp, add, read, row_of, pixel_centre, opacity = _tools(wp, single)
+
+    @wp.func
+    def passed(through: real, limits: vec4, width: real):
+        """Sigmoid, its derivative, and its argument."""
+        at = (limits[3] - through) / width
+        value = real(1.0) / (real(1.0) + wp.exp(-at))
+        return value, value * (real(1.0) - value), at
+
+    @wp.func
+    def moved(through: real, slope: real, width: real):
+        """c'(T) T; that of T = 1 in front of all splats depends on none of them."""
+        out = real(0.0)
+        if through < real(1.0):
+            out = -slope * through / width
+        return out
+
+    @kernel
+    def soft_surface(
+        transmittance: wp.array3d(dtype=real), sums: wp.array3d(dtype=vec4), rows: wp.array3d(dtype=vec4),
+        rank: wp.array2d(dtype=wp.int32), start: wp.array2d(dtype=wp.int32), limits: wp.array1d(dtype=vec4),
+        sizes: wp.array2d(dtype=wp.int32), widths: wp.array1d(dtype=real),
+    ):  # fmt: skip
+        b, tile, pixel = wp.tid()
+        limit, width = limits[b], widths[b]
+        at = pixel_centre(tile, pixel, sizes[b, 0], sizes[b, 1])
+        through, total = real(transmittance[b, tile, pixel]), vec4(sums[b, tile, pixel])
+        for s in range(start[b, tile], start[b, tile + 1]):
+            if through <= limit[2]:
+                break
+            row = row_of(rows, b, rank[b, s])
+            first, second = read(rows, row), read(rows, row + wp.int64(1))
+            alpha = wp.min(opacity(first, second, at[0] - first[0], at[1] - first[1]), limit[1])
+            if alpha >= limit[0]:
+                after = through * (real(1.0) - alpha)
+                front, slope, place = passed(through, limit, width)
+                behind, slope_behind, place_behind = passed(after, limit, width)
+                change = moved(after, slope_behind, width) - moved(through, slope, width)
+                by_width = slope_behind * place_behind - slope * place
+                total += second[2] * vec4(behind - front, change, slope_behind - slope, by_width)
+                through = after
+        transmittance[b, tile, pixel] = through
+        sums[b, tile, pixel] = total
+
+    @kernel
+    def soft_surface_adjoint(
+        transmittance: wp.array3d(dtype=real), prefix: wp.array3d(dtype=real), of_rows: wp.array3d(dtype=vec4),
+        total: wp.array3d(dtype=real), of_depth: wp.array3d(dtype=real), of_last: wp.array3d(dtype=real),
+        rows: wp.array3d(dtype=vec4), rank: wp.array2d(dtype=wp.int32), start: wp.array2d(dtype=wp.int32),
+        limits: wp.array1d(dtype=vec4), sizes: wp.array2d(dtype=wp.int32), widths: wp.array1d(dtype=real),
+    ):  # fmt: skip
+        b, tile, pixel = wp.tid()
+        limit, width, given = limits[b], widths[b], of_depth[b, tile, pixel]
+        at, whole = pixel_centre(tile, pixel, sizes[b, 0], sizes[b, 1]), int(0)
+        if transmittance.shape[2] % 32 == 0:
+            whole = 1
+        through, done = real(transmittance[b, tile, pixel]), real(prefix[b, tile, pixel])
+        for s in range(start[b, tile], start[b, tile + 1]):
+            is_open = int(0)
+            if through > limit[2]:
+                is_open = 1
+            if any_of_warp(is_open, whole) == 0:
+                break
+            row = row_of(rows, b, rank[b, s])
+            first, second = read(rows, row), read(rows, row + wp.int64(1))
+            u, v = at[0] - first[0], at[1] - first[1]
+            unclamped = opacity(first, second, u, v)
+            alpha = wp.min(unclamped, limit[1])
+            slope, share, seen = real(0.0), real(0.0), int(0)
+            if is_open == 1 and alpha >= limit[0]:
+                seen = 1
+                after = through * (real(1.0) - alpha)
+                front, sloped, _ = passed(through, limit, width)
+                behind, sloped_behind, _ = passed(after, limit, width)
+                done -= second[2] * moved(through, sloped, width)
+                if unclamped < limit[1]:
+                    ahead = given * (total[b, tile, pixel] - done) + of_last[b, tile, pixel]
+                    slope = -alpha / (real(1.0) - alpha) * ahead
+                done += second[2] * moved(after, sloped_behind, width)
+                share = given * (behind - front)
+                through = after
+            if any_of_warp(seen, whole) == 1:
+                a, half, c = first[2], real(0.5) * slope, second[0]
+                by_place = vec4(
+                    slope * (a * u + first[3] * v), slope * (c * v + first[3] * u), -half * u * u, -slope * u * v
+                )
+                add(of_rows, row, by_place, 4, whole)
+                add(of_rows, row + wp.int64(1), vec4(-half * v * v, slope, share, real(0.0)), 3, whole)
+        transmittance[b, tile, pixel] = through
+        prefix[b, tile, pixel] = done
+
+    name = "float" if single else "double"
+    return SurfaceKernels(
+        launcher(soft_surface, f"soft_surface_{name}", 2, ("transmittance", "sums")),
+        launcher(soft_surface_adjoint, f"soft_surface_adjoint_{name}", 3, ("transmittance", "prefix", "of_rows")),
+    )
+
+
+@functools.cache
+@no_type_check
 def list_kernels(single: bool) -> ListKernels:
     """Kernels that write the slots of lists and sum credits, in single or double precision."""
     wp = import_warp()
-    kernel, real, vec4, _, _, read, pixel_centre, opacity = _tools(wp, single)
-    pair = wp.vec2i
+    kernel, real, vec4, _, _, read, row_of, pixel_centre, opacity = _tools(wp, single)
+    pair, most = wp.vec2i, _SORTED_AT_ONCE
+
+    @wp.func
+    def place(images: int, b: int, slots: int, values: int):
+        """Row and column of the buffer at which an image's slots begin, and what is added to its keys."""
+        together = wp.clamp(wp.static(most) // wp.max(slots, values), 1, images)
+        number = b % together
+        return b - number + number // 2, number % 2 * slots, number * values
 
     @wp.func
     def fall(a: real, b: real, c: real, u: real, v: real):
@@ -233,15 +370,17 @@ def list_kernels(single: bool) -> ListKernels:
 
     @kernel
     def list_slots(
-        tile: wp.array2d(dtype=wp.int32), rank: wp.array2d(dtype=wp.int32), shapes: wp.array3d(dtype=real),
+        keys: wp.array2d(dtype=wp.int32), ranks: wp.array2d(dtype=wp.int32), shapes: wp.array3d(dtype=real),
         low: wp.array2d(dtype=pair), size: wp.array2d(dtype=pair), end: wp.array2d(dtype=wp.int32),
         before: wp.array2d(dtype=wp.int32), open_: wp.array2d(dtype=wp.int32), limits: wp.array1d(dtype=vec4),
         sizes: wp.array2d(dtype=wp.int32),
     ):  # fmt: skip
         b, slot = wp.tid()
-        count, columns, edge = shapes.shape[1], sizes[b, 0], sizes[b, 1]
+        slots, count, columns, edge = keys.shape[1] // 2, shapes.shape[1], sizes[b, 0], sizes[b, 1]
+        if slot >= slots:
+            return
         found, owner = open_.shape[1], int(0)  # a tile beyond the last owns what is not kept
-        if slot < tile.shape[1] // 2 and slot < end[b, count - 1]:
+        if slot < end[b, count - 1]:
             left, right = int(0), count - 1  # the first splat whose pairs end beyond this slot
             while left < right:
                 middle = (left + right) // 2
@@ -272,8 +411,30 @@ def list_kernels(single: bool) -> ListKernels:
                 )
             if open_[b, here] != 0 and shapes[b, owner, 5] - lowest >= limits[b][0]:
                 found = here
-        tile[b, slot] = found
-        rank[b, slot] = owner
+        line, first, low_key = place(keys.shape[0], b, slots, open_.shape[1] + 1)
+        keys[line, first + slot] = low_key + found
+        ranks[line, first + slot] = owner
+
+    @kernel
+    def cut_lists(
+        keys: wp.array2d(dtype=wp.int32), ranks: wp.array2d(dtype=wp.int32), open_: wp.array2d(dtype=wp.int32),
+        tile: wp.array2d(dtype=wp.int32), rank: wp.array2d(dtype=wp.int32), start: wp.array2d(dtype=wp.int32),
+    ):  # fmt: skip
+        b, slot = wp.tid()
+        slots, values = tile.shape[1], open_.shape[1] + 1
+        line, first, low_key = place(keys.shape[0], b, slots, values)
+        if slot < slots:
+            tile[b, slot] = keys[line, first + slot] - low_key
+            rank[b, slot] = ranks[line, first + slot]
+        if slot < values:  # the first slot of this tile or of a later one
+            left, right = int(0), slots
+            while left < right:
+                middle = (left + right) // 2
+                if keys[line, first + middle] < low_key + slot:
+                    left = middle + 1
+                else:
+                    right = middle
+            start[b, slot] = left
 
     @kernel
     def credit(
@@ -289,8 +450,8 @@ def list_kernels(single: bool) -> ListKernels:
             if through <= limits[b][2]:
                 break
             splat = rank[b, s]
-            row = (b * rows.shape[1] + splat) * wp.static(QUADS)
-            first, second = read(rows, row), read(rows, row + 1)
+            row = row_of(rows, b, splat)
+            first, second = read(rows, row), read(rows, row + wp.int64(1))
             alpha = wp.min(opacity(first, second, at[0] - first[0], at[1] - first[1]), limits[b][1])
             if alpha >= limits[b][0]:
                 weight = alpha * through
@@ -303,7 +464,8 @@ def list_kernels(single: bool) -> ListKernels:
 
     name = "float" if single else "double"
     return ListKernels(
-        launcher(list_slots, f"list_slots_{name}", 2, ("tile", "rank")),
+        launcher(list_slots, f"list_slots_{name}", 2, ("keys", "ranks")),
+        launcher(cut_lists, f"cut_lists_{name}", 3),
         launcher(credit, f"credit_{name}", 2, ("credits_",)),
     )
 
@@ -311,18 +473,22 @@ def list_kernels(single: bool) -> ListKernels:
 @functools.cache
 @no_type_check
 def radix_sort() -> Any:
-    """A stable sort of (tile, rank) by tile, as a function of JAX arrays: keys and values of each image.
+    """A stable sort of the slots of all images by tile, as a function of (keys, ranks, open tiles) -> keys, ranks.
 
-    Keys and values have room for twice their number, which a radix sort needs; it sorts the first half. A third array
-    has as many entries as there are keys, which tells the bits to sort by.
+    The images of a batch are one array that begins with all keys; behind them is the room that a radix sort needs. The
+    key of a slot is the number of its tile, beyond those of the images before it. As many images are sorted together as
+    32 bits allow.
     """
     wp = import_warp()
 
     def sort_slots(
-        tile: wp.array2d(dtype=wp.int32), rank: wp.array2d(dtype=wp.int32), keys: wp.array2d(dtype=wp.int32)
+        keys: wp.array2d(dtype=wp.int32), ranks: wp.array2d(dtype=wp.int32), open_tiles: wp.array2d(dtype=wp.int32)
     ):
-        bits = max(int(keys.shape[1] - 1).bit_length(), 1)
-        for image in range(tile.shape[0]):
-            wp.utils.radix_sort_pairs(tile[image], rank[image], tile.shape[1] // 2, 0, bits)
+        images, slots, values = keys.shape[0], keys.shape[1] // 2, open_tiles.shape[1] + 1
+        together = min(max(_SORTED_AT_ONCE // max(slots, values), 1), images)
+        for first in range(0, images, together):
+            part = slice(first, min(first + together, images))
+            count, own = part.stop - first, (keys, ranks) if together == images else (keys[part], ranks[part])
+            wp.utils.radix_sort_pairs(*own, count * slots, 0, max((count * values - 1).bit_length(), 1))
 
-    return caller(sort_slots, "sort_slots", 2, ("tile", "rank"))
+    return caller(sort_slots, "sort_slots", 2, ("keys", "ranks"))

@@ -219,6 +219,30 @@ def test_kernels_compile_for_cuda(tmp_path, monkeypatch):
             assert re.search(r"\b(red|atom)\.global[.a-z0-9]*\.v4", text), name
 
 
+@needs_warp
+def test_a_call_is_numbered_by_its_shapes():
+    """A CUDA device finds a recorded graph again by this number and addresses, which recur from shape to shape."""
+    warp = pytest.importorskip("warp")
+
+    def twice(given: warp.array(dtype=float), other: warp.array2d(dtype=float)):
+        other.zero_()
+
+    call = backend.caller(twice, "twice", 1)
+
+    def number(count, size, batch=None):
+        def run(given):
+            return call(given, output_dims={"other": (size, 2)})
+
+        shape = (count,) if batch is None else (batch, count)
+        program = jax.make_jaxpr(run if batch is None else jax.vmap(run))(jnp.zeros(shape))
+        return re.search(r"call_id=(\d+)|'call_id', (\d+)", str(program)).group(0), program.out_avals[0].shape
+
+    numbers = [number(4, 1)[0], number(4, 2)[0], number(8, 1)[0], number(4, 1, batch=3)[0], number(4, 1, batch=5)[0]]
+    assert len(set(numbers)) == 5
+    assert number(4, 1)[0] == numbers[0]
+    assert number(4, 1, batch=3)[1] == (3, 1, 2)
+
+
 def test_a_machine_without_a_gpu_takes_xla():
     if jax.default_backend() == "cpu":
         assert not backend.takes_warp("auto", "reverse")

@@ -3,6 +3,7 @@
 import functools
 import importlib.util
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,11 +13,12 @@ from pigjax.core.camera import look_at
 from pigjax.core.errors import InputError
 from pigjax.splat import RenderConfig, Splats, render
 from pigjax.splatting.binning import bin_splats, blend_config, list_pass
-from pigjax.splatting.contributions import credits_of_candidates
+from pigjax.splatting.contributions import credits_of_candidates, soft_surface_depth
 from pigjax.splatting.projection import project_splats
 from pigjax.splatting.types import OUTPUTS
 
 needs_warp = pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="needs warp-lang")
+ROADS = ("warp", "xla")
 CAMERA = look_at((0.3, -3.0, 0.4), (0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0), focal=40.0, width=37, height=29)
 
 
@@ -147,6 +149,66 @@ def test_credits_are_those_of_xla(x64):
         return credits_of_candidates(splats, CAMERA, RenderConfig(backend=backend), mask, candidates)
 
     check_equal(credits("warp"), credits("xla"), 1e-10)
+
+
+@pytest.mark.parametrize("backend", ["auto", "xla", pytest.param("warp", marks=needs_warp)])
+def test_no_splat_gives_no_credit_and_no_surface(backend):
+    splats, config = jax.tree.map(lambda part: part[:0], scene(1)), RenderConfig(backend=backend)
+    mask, candidates = jnp.zeros((CAMERA.height, CAMERA.width), jnp.int32), jnp.zeros((0, 2), jnp.int32)
+    assert credits_of_candidates(splats, CAMERA, config, mask, candidates).shape == (0, 2)
+    depth, presence, overflow = soft_surface_depth(splats, CAMERA, config, tau_T=0.5, temperature=0.1)
+    assert (depth == 1).all()
+    assert not presence.any()
+    assert overflow == 0
+
+
+@needs_warp
+@pytest.mark.slow
+@pytest.mark.parametrize("config", [{}, {"tile_size": 8, "slots": 150, "transmittance_min": 0.05}], ids=["", "passes"])
+def test_soft_surface_is_that_of_xla(x64, config):
+    """With its gradient by splats, threshold and temperature; opaque splats meet the clamp of alpha."""
+    splats, rng = scene(60), np.random.default_rng(5)
+    splats = eqx.tree_at(lambda s: s.opacities, splats, splats.opacities.at[:9].set(1.0))
+    weight = jnp.asarray(rng.normal(size=(2, CAMERA.height, CAMERA.width)))
+
+    @functools.partial(jax.jit, static_argnums=0)
+    @functools.partial(jax.value_and_grad, argnums=(1, 2, 3), has_aux=True)
+    def found(backend, splats, tau, temperature):
+        settings = RenderConfig(backend=backend, **config | {"slots": None} if backend == "xla" else config)
+        depth, presence, _ = soft_surface_depth(splats, CAMERA, settings, tau_T=tau, temperature=temperature)
+        return (weight[0] * depth).sum() + (weight[1] * presence).sum(), (depth, presence)
+
+    for tau, temperature in ((0.5, 0.1), (0.9, 0.01)):
+        ours, oracle = (found(backend, splats, jnp.asarray(tau), jnp.asarray(temperature)) for backend in ROADS)
+        check_equal(ours, oracle, 1e-8)
+
+
+@needs_warp
+@pytest.mark.slow
+@pytest.mark.parametrize("at_once", [2**30, 1700], ids=["together", "two and one"])
+def test_lists_of_three_images_are_sorted_together(monkeypatch, at_once):
+    """All slots in one sort, or as many images at once as the keys hold."""
+    from pigjax.splatting import warp_binning, warp_kernels
+
+    monkeypatch.setattr(warp_kernels, "_SORTED_AT_ONCE", at_once)
+    for name in ("list_kernels", "radix_sort"):
+        monkeypatch.setattr(warp_binning, name, getattr(warp_kernels, name).__wrapped__)
+    splats = scene(50)
+
+    def lists(position, backend):
+        camera = look_at(position, (0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0), focal=40.0, width=37, height=29)
+        config = RenderConfig(backend=backend, tile_size=8)
+        blending = blend_config(camera, config, len(splats), surface=False)
+        projected = project_splats(splats, camera, config)
+        boxes = bin_splats(projected, blending)
+        return list_pass(projected.shapes[boxes.order], boxes, 0, None, blending, 800)
+
+    positions = jnp.asarray([(0.3, -3.0, 0.4), (2.0, -2.0, 0.1), (0.0, 0.5, 4.0)])
+    ours, oracle = (jax.jit(jax.vmap(functools.partial(lists, backend=name)))(positions) for name in ROADS)
+    np.testing.assert_array_equal(ours.start, oracle.start)
+    for own, other, owned in zip(ours.rank, oracle.rank, oracle.start[:, -1]):
+        assert owned > 30
+        np.testing.assert_array_equal(own[:owned], other[:owned])
 
 
 def test_warp_asked_for_in_forward_mode_is_refused():
