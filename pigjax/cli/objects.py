@@ -215,7 +215,7 @@ def segment(
         int,
         typer.Option(
             help="Steps of a fit of each object alone, after which Gaussians end where the masks end, into"
-            " OUT/gaussians.ply; 64 do. 0: none.",
+            " OUT/refit.ply; 64 do. 0: none.",
             min=0,
         ),
     ] = 0,

@@ -54,7 +54,7 @@ def segment_files(
 ) -> dict[int, int]:
     """Lift masks and write `labels.npz`, `objects/<id>_<name>.ply`, `coloured.ply` and `objects.png`. Host.
 
-    With `refit` also `gaussians.ply`, the scene that the labels belong to.
+    With `refit` also `refit.ply`, the scene that the labels belong to.
 
     For each object to remove also `removed/<id>_<name>.ply`, the scene without it, `removed/<id>_<name>/<view>.png`,
     its hole in every view (white: pixels for an inpainter), and `removed/<id>_<name>.png`, a few views before
@@ -86,7 +86,7 @@ def segment_files(
     """
     doomed = [_id_of(name, names) for name in remove]
     folders = ("objects", "removed") if doomed else ("objects",)
-    files = ("labels.npz", "coloured.ply", "objects.png", *(("gaussians.ply",) if refit else ()))
+    files = ("labels.npz", "coloured.ply", "objects.png", *(("refit.ply",) if refit else ()))
     out = io.output_folder(out, files=files, folders=folders)
     parts = io.parts_of(
         {
@@ -104,7 +104,7 @@ def segment_files(
             },
         }
     )
-    results = ("labels.npz", "coloured.ply", "objects.png", "gaussians.ply", "objects", "removed")
+    results = ("labels.npz", "coloured.ply", "objects.png", "refit.ply", "objects", "removed")
     io.claim(out, parts, results=results, overwrite=overwrite)
     io.output_folder(out / "objects")
     train = views.voters
@@ -119,7 +119,7 @@ def segment_files(
         options["valid"] = held.valid
         fitted = refit_boundaries(gaussians, held.cameras, ids, steps=refit, callback=progress, **options)
         gaussians, labels = fitted.gaussians, fitted.labels
-        io.save_ply(out / "gaussians.ply", gaussians, origin=origin)
+        io.save_ply(out / "refit.ply", gaussians, origin=origin)
     else:
         labels = lift(gaussians, train.cameras, masks, **options)
     object_id = np.asarray(labels.object_id)

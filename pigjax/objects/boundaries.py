@@ -230,6 +230,8 @@ def _goal(
 
     def picture(camera):
         frame = render(gaussians, camera, config, outputs=("rgb", "alpha"))
+        assert frame.rgb is not None
+        assert frame.alpha is not None
         return _Pictures(frame.rgb, frame.alpha)
 
     def reach(camera):
