@@ -180,7 +180,7 @@ def _lengths(gaussians: Gaussians, chosen: Int[np.ndarray, "m"], cameras: Camera
     longest = np.exp(np.asarray(gaussians.log_scales, np.float64)[chosen].max(1))
     pixels = np.zeros(len(chosen))
     for pose, focal in zip(np.asarray(cameras.world_to_cam, np.float64), np.asarray(cameras.focal, np.float64)):
-        depth = means @ pose[2, :3] + pose[2, 3]
+        depth = np.einsum("nj,j->n", means, pose[2, :3]) + pose[2, 3]
         ahead = depth > 1e-6 * longest
         pixels = np.maximum(pixels, np.where(ahead, focal.max() / np.where(ahead, depth, 1.0), 0.0))
     return 2 * _HALF * longest * pixels

@@ -157,7 +157,7 @@ def test_a_refit_ends_objects_at_their_masks_and_keeps_the_picture(tmp_path):
     io.save_masks(tmp_path / "object_mask", ["a"], masks)
     command = ["segment", str(tmp_path / "scene.ply"), str(tmp_path), "-o", str(tmp_path / "out"), "--refit", "60"]
     assert CliRunner().invoke(app, command, catch_exceptions=False).exit_code == 0
-    written = io.load_ply(tmp_path / "out" / "gaussians.ply")
+    written = io.load_ply(tmp_path / "out" / "refit.ply")
     assert len(written) == len(scene)
     assert not np.array_equal(written.means, scene.means)
     stored = io.load_labels(tmp_path / "out" / "labels.npz", len(written), scene=io.digest_of_scene(written))
