@@ -254,22 +254,35 @@ def sleep(_):
 
 
 def batch(_):
-    """Simulations of 1,000 particles together by vmap, against one after another."""
-    print(head("simulations of 1k/24³, 20 steps", "together ms", "one after another ms", "gain"))
-    particles, _, table = scene("neo_hookean", 1000, 24)
-    grid = fit_grid(particles.x, 1 / 24, margin=1 / 24)
+    """Small simulations together: by vmap and by lax.map, against a Python loop of one compiled program."""
+    print(head("particles", "simulations", "one after another ms", "vmap ms", "gain", "lax.map ms", "gain"))
+    for particles, nodes in ((100, 12), (1000, 24), (8000, 48)):
+        single = _fall(particles, nodes)
+        alone, vmapped = jax.jit(single), jax.jit(jax.vmap(single))
+        mapped = jax.jit(partial(jax.lax.map, single))
+        for count in (1, 8, 16):
+            young = jnp.linspace(1e4, 1e5, count)
+            runs = {
+                "serial": lambda young=young, alone=alone: [alone(e) for e in young],
+                "vmap": partial(vmapped, young),
+                "map": partial(mapped, young),
+            }
+            serial, *others = in_turn(runs, windows=5).values()
+            cells = [cell for run in others for cell in (f"{run.seconds * 1e3:.1f}", f"{serial.over(run):.2f}")]
+            print(row(f"{particles}/{nodes}³", count, f"{serial.seconds * 1e3:.1f}", *cells))
+
+
+def _fall(count, nodes):
+    """Positions after 20 steps of a falling cube, by its stiffness; its grid is fitted to it."""
+    particles, _, table = scene("neo_hookean", count, nodes)
+    grid = fit_grid(particles.x, 1 / nodes, margin=1 / nodes)
 
     def end(young):
         own = eqx.tree_at(lambda t: t.young, table, jnp.full_like(table.young, young))
         settings = SimConfig(substeps=20, devices=1)
         return rollout(particles, grid, own, settings, frames=1, frame_dt=20 * DT, gravity=DOWN)[0].x
 
-    single, together = jax.jit(end), jax.jit(jax.vmap(end))
-    for count in (1, 4, 16):
-        young = jnp.linspace(1e4, 1e5, count)
-        runs = {"together": partial(together, young), "serial": lambda young=young: [single(e) for e in young]}
-        vmapped, serial = in_turn(runs, windows=5).values()
-        print(row(count, f"{vmapped.seconds * 1e3:.1f}", f"{serial.seconds * 1e3:.1f}", f"{serial.over(vmapped):.2f}"))
+    return end
 
 
 def memory(options):

@@ -22,7 +22,7 @@ from pigjax.core.extent import typical_distance
 from pigjax.core.harmonics import rotated_sh
 from pigjax.mpm import Grid
 from pigjax.mpm.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
-from pigjax.mpm.contact import BodyContact
+from pigjax.mpm.contact import BodyContact, faces
 from pigjax.mpm.forces import ForceField, Impulse, Matter, Spring, Wind
 from pigjax.mpm.materials import LAWS, Material, material_table
 from pigjax.mpm.materials.laws import respond
@@ -378,7 +378,7 @@ def parted(mass: Any, velocity: Any) -> Any:
     place = jnp.stack(jnp.meshgrid(*[jnp.arange(4, dtype=mass.dtype)] * 3, indexing="ij"), -1)
     speed = jnp.stack([velocity, -velocity])[:, None, None, None]
     shape = jnp.broadcast_to(speed, (2, 4, 4, 4, 3))
-    return BodyContact(bodies=2, friction=0.3).part(shape, volume * mass, volume, volume * place)
+    return BodyContact(bodies=2, friction=0.3).part(shape, volume * mass, faces(volume, volume * place))
 
 
 STEPS = np.array([1e-12, 1e-9, 1e-6, 1e-3, 1, 1e3, 1e6, 1e9, 1e12, 1e15])
