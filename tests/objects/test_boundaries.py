@@ -57,6 +57,7 @@ def test_halves_keep_mean_covariance_and_the_light_that_they_stop():
         assert after.sum() == pytest.approx(before.sum(), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_only_gaussians_across_an_edge_are_cut():
     across = (0.02, 0.0, 0.12, 0.03, 0.01, 0.0)
     inside, along = (0.3, 0.2, 0.04, 0.03, 0.01, 0.0), (-0.2, -0.3, 0.03, 0.12, 0.01, 0.0)
