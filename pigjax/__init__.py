@@ -45,6 +45,7 @@ from pigjax.mpm.materials import Material, MaterialTable, material_table, preset
 from pigjax.mpm.sleep import Sleep
 from pigjax.mpm.timestep import choose_integrator, choose_substeps, stable_dt
 from pigjax.objects.association import Association, associate_masks, compact_ids
+from pigjax.objects.boundaries import Refit, cut_straddling, refit_boundaries
 from pigjax.objects.editing import extract_object, hole_mask, remove_object
 from pigjax.objects.evaluation import evaluate_labels
 from pigjax.objects.selection import grow_selection, select_colour, select_part, select_stroke
@@ -95,6 +96,7 @@ __all__ = [
     "OwnSplats",
     "Particles",
     "Plane",
+    "Refit",
     "RenderConfig",
     "Run",
     "RunReport",
@@ -127,6 +129,7 @@ __all__ = [
     "compact_ids",
     "contributions",
     "cut_outliers",
+    "cut_straddling",
     "deform",
     "eigen_clamp",
     "evaluate_labels",
@@ -170,6 +173,7 @@ __all__ = [
     "prune",
     "psnr",
     "reconstruct",
+    "refit_boundaries",
     "remove_object",
     "render",
     "required_capacity",

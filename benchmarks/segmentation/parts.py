@@ -7,7 +7,7 @@ object_mask, names.json, points.ply, points.ids.npy), `--ply` reconstructions to
 from functools import cache
 from pathlib import Path
 
-from benchmarks.segmentation import association, comparison, memory, noise, sweep, trained, votes
+from benchmarks.segmentation import association, comparison, memory, noise, refit, sweep, trained, votes
 from benchmarks.segmentation.tabletop import load_tabletop
 
 read = cache(load_tabletop)
@@ -15,6 +15,7 @@ worker = memory.worker
 STUDIES = {
     "votes": ("Votes on a cloud with known ids", votes.study),
     "trained": ("Objects of a reconstructed scene", trained.study),
+    "refit": ("Boundaries refit", refit.study),
     "comparison": ("Beside rivals' methods", comparison.compare),
     "association": ("Masks without consistent ids", association.study),
     "noise": ("Noisy masks", noise.study),
@@ -27,7 +28,7 @@ PARTS = {
 PARTS["memory"] = ("Memory of a large vote", memory.study)
 OPTIONS = {
     "folder": {"type": Path, "help": "another tabletop"},
-    "ply": {"type": Path, "nargs": "*", "default": [], "help": "reconstructions of part trained"},
+    "ply": {"type": Path, "nargs": "*", "default": [], "help": "reconstructions of parts trained and refit"},
     "steps": {"type": int, "default": 800, "help": "of training of rivals in part comparison"},
     "large": {"type": int, "nargs": 4, "default": [1_000_000, 256, 300, 256], "help": "Gaussians, ids, views and pixels"
               " along a side of part memory"},

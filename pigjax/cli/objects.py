@@ -211,6 +211,14 @@ def segment(
     associate: Annotated[
         bool, typer.Option("--associate", help="Masks have ids of their own in each view: link those of one object.")
     ] = False,
+    refit: Annotated[
+        int,
+        typer.Option(
+            help="Steps of a fit of each object alone, after which Gaussians end where the masks end, into"
+            " OUT/refit.ply; 64 do. 0: none.",
+            min=0,
+        ),
+    ] = 0,
     select: Annotated[
         list[str] | None,
         typer.Option(
@@ -229,15 +237,16 @@ def segment(
 ) -> None:
     """Lift masks to the Gaussians; writes labels, one .ply per object, and a sheet that shows which id is which.
 
-    With --remove also the scene without an object, and the hole that it leaves in every view. With --select objects are
-    chosen by place, colour or a stroke painted in a photo instead of masks; a scene reads them by input.labels.
+    With --remove also the scene without an object, and the hole that it leaves in every view. With --refit Gaussians
+    end where the masks end, for objects that are drawn alone or moved. With --select objects are chosen by
+    place, colour or a stroke painted in a photo instead of masks; a scene reads them by input.labels.
     """
     from pigjax import io
     from pigjax.cli.segmenting import segment_files
     from pigjax.cli.selecting import select_files
 
-    if select and (masks is not None or associate or remove):
-        raise InputError("--select chooses without masks; give it without --masks, --associate and --remove.")
+    if select and (masks is not None or associate or remove or refit):
+        raise InputError("--select chooses without masks; give it without --masks, --associate, --refit and --remove.")
     if views is None and not select:
         raise InputError("posed photos are missing: name them after the Gaussians, or choose objects by --select.")
     cloud = io.load_gaussians(gaussians, drop_invalid=drop_invalid, origin=origin)
@@ -252,10 +261,17 @@ def segment(
     )
     known = {} if names is None else io.load_names(names)
     settings = _settings(tau_t, tau_d, weighting, purity, min_seen)
-    counts = segment_files(
-        cloud, loaded, known, out, fill=fill, remove=remove or (), associate=associate, origin=origin,
-        overwrite=overwrite, **settings,
-    )  # fmt: skip
+    with progress("{task.fields[state]}") as bar:
+        task = bar.add_task("refit", total=refit, state="") if refit else None
+
+        def tell(done: int, loss: float) -> None:
+            if task is not None:
+                bar.update(task, completed=done, state=f"loss {loss:.4f}")
+
+        counts = segment_files(
+            cloud, loaded, known, out, fill=fill, remove=remove or (), associate=associate, refit=refit, origin=origin,
+            progress=tell, overwrite=overwrite, **settings,
+        )  # fmt: skip
     _tell_objects(counts, {-1: "never seen", **known}, out)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from pigjax.core.harmonics import sh_degree_of
 from pigjax.core.upright import find_up
 from pigjax.io.files import existing
 from pigjax.objects.association import associate_masks
+from pigjax.objects.boundaries import refit_boundaries
 from pigjax.objects.editing import extract_object, hole_mask, remove_object
 from pigjax.objects.lifting import lift
 from pigjax.objects.overlay import colours_of, legend_sheet, overlay
@@ -45,11 +46,15 @@ def segment_files(
     fill: bool,
     remove: Sequence[str] = (),
     associate: bool = False,
+    refit: int = 0,
     origin: tuple[float, float, float] | None = None,
+    progress: Callable[[int, float], None] = lambda done, loss: None,
     overwrite: bool = False,
     **settings: Any,
 ) -> dict[int, int]:
     """Lift masks and write `labels.npz`, `objects/<id>_<name>.ply`, `coloured.ply` and `objects.png`. Host.
+
+    With `refit` also `refit.ply`, the scene that the labels belong to.
 
     For each object to remove also `removed/<id>_<name>.ply`, the scene without it, `removed/<id>_<name>/<view>.png`,
     its hole in every view (white: pixels for an inpainter), and `removed/<id>_<name>.png`, a few views before
@@ -65,7 +70,10 @@ def segment_files(
         remove: names or ids of objects.
         associate: link masks whose ids mean something else in every view (`associate_masks`); object 1 is then the one
             that is seen most.
+        refit: steps of `refit_boundaries`, which end Gaussians where the masks end; 0, the default, leaves them as they
+            are.
         origin: offset subtracted from the scene's positions [m], added again in the files; None: none.
+        progress: called with the steps of the refit that are done, and their loss.
         overwrite: remove results in `out` of other Gaussians, views, masks, names or settings, instead of refusing it.
         settings: of `lift_masks`.
 
@@ -78,7 +86,8 @@ def segment_files(
     """
     doomed = [_id_of(name, names) for name in remove]
     folders = ("objects", "removed") if doomed else ("objects",)
-    out = io.output_folder(out, files=("labels.npz", "coloured.ply", "objects.png"), folders=folders)
+    files = ("labels.npz", "coloured.ply", "objects.png", *(("refit.ply",) if refit else ()))
+    out = io.output_folder(out, files=files, folders=folders)
     parts = io.parts_of(
         {
             "Gaussians": io.digest(gaussians),
@@ -86,10 +95,16 @@ def segment_files(
             "photos": io.digest(views.images, views.names, views.splits),
             "masks": io.digest(views.masks) if views.valid is None else io.digest(views.masks, views.valid),
             "names": io.digest(names),
-            "": {**settings, "fill": fill, "origin": origin, **({"associate": True} if associate else {})},
+            "": {
+                **settings,
+                "fill": fill,
+                "origin": origin,
+                **({"associate": True} if associate else {}),
+                **({"refit": refit} if refit else {}),
+            },
         }
     )
-    results = ("labels.npz", "coloured.ply", "objects.png", "objects", "removed")
+    results = ("labels.npz", "coloured.ply", "objects.png", "refit.ply", "objects", "removed")
     io.claim(out, parts, results=results, overwrite=overwrite)
     io.output_folder(out / "objects")
     train = views.voters
@@ -98,7 +113,15 @@ def segment_files(
     if associate:
         tolerances = {name: settings[name] for name in ("tau_T", "tau_d") if name in settings}
         masks = associate_masks(gaussians, train.cameras, masks, **tolerances).masks
-    labels = lift(gaussians, train.cameras, masks, fill=fill, valid=train.valid, **settings)
+    options = {"fill": fill, "valid": train.valid, **settings}
+    if refit:
+        held, ids = _with_views_without_masks(views, train, np.asarray(masks))
+        options["valid"] = held.valid
+        fitted = refit_boundaries(gaussians, held.cameras, ids, steps=refit, callback=progress, **options)
+        gaussians, labels = fitted.gaussians, fitted.labels
+        io.save_ply(out / "refit.ply", gaussians, origin=origin)
+    else:
+        labels = lift(gaussians, train.cameras, masks, **options)
     object_id = np.asarray(labels.object_id)
     mark = io.digest_of_scene(gaussians) if origin is None else None  # else positions are not those of the file
     io.save_labels(out / "labels.npz", object_id, labels.votes, labels.confidence, labels.ids, scene=mark)
@@ -114,6 +137,16 @@ def segment_files(
     for number in doomed:
         _remove(gaussians, labels, number, views, out / "removed", _stem(number, names), origin)
     return counts
+
+
+def _with_views_without_masks(views: io.Views, voters: io.Views, masks: np.ndarray) -> tuple[io.Views, np.ndarray]:
+    """Training views, and the masks of those that vote; -1 in the others."""
+    held = views.training
+    if not set(voters.names) <= set(held.names):
+        return voters, masks
+    ids = np.full((len(held), *masks.shape[1:]), -1, np.int64)
+    ids[[held.names.index(name) for name in voters.names]] = masks
+    return held, ids
 
 
 def _stem(number: int, names: dict[int, str]) -> str:

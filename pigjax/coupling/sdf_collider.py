@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from pigjax.core.arguments import checked
@@ -20,7 +23,7 @@ _NEIGHBOURS = 64  # surface samples that the distance at a point depends on
 _SMOOTHING = 3  # width of their weights, in distances between samples; trained splats lie unevenly
 _MARGIN = 3  # grid samples around the object
 _COARSE = 4  # lattice samples from one that is always computed to the next
-_TOGETHER = 20_000  # points whose neighbours are held at once: 80 MB
+_TOGETHER = 20_000  # points whose neighbours are held at once: 30 MB
 _DEPTH = 16  # grid samples behind it: an open surface is solid that deep
 
 
@@ -81,8 +84,9 @@ def sampled_distance(
 ) -> Float[np.ndarray, "x y z"]:
     """Signed distance on a lattice [m]: exact near the surface, interpolated where it is far.
 
-    Every fourth sample is computed, and all samples of the coarse cells that may hold the surface; a distance changes
-    by no more than the path, so that the other cells do not. Work and memory grow with the surface, not with the box.
+    Every fourth sample is computed, then twice those midway between them in cells that may hold the surface; a distance
+    changes by no more than the path, so that the other cells do not. Work and memory grow with the surface, not with
+    the box.
 
     Args:
         points: surface samples [m].
@@ -92,30 +96,37 @@ def sampled_distance(
         spacing: between its samples [m].
         shape: samples along each axis.
     """
-    cells = -(-(shape - 1) // _COARSE)
-    tree = cKDTree(points)
+    stride, tree = _COARSE, cKDTree(points)
+    cells = -(-(shape - 1) // stride)
+    values = np.zeros(cells + 1)
+    known = np.zeros(cells + 1, bool)
+    wanted = ~known
+    while True:
+        index = np.argwhere(wanted)
+        values[wanted] = signed_distance(low + stride * spacing * index, points, normals, width, tree)
+        if stride == 1:
+            return values[tuple(slice(n) for n in shape)]
+        # no point of a cell is further than the first term from the nearest of its corners
+        reach = (stride * np.sqrt(3) / 2 + 1) * spacing
+        near = ndimage.minimum_filter(np.abs(values), 2, origin=-1)[tuple(slice(n) for n in cells)] <= reach
+        known |= wanted
+        finer = np.zeros(2 * cells + 1, bool)
+        finer[::2, ::2, ::2] = known
+        values, known, wanted = _halfway(values), finer, np.zeros(2 * cells + 1, bool)
+        for offset in product((0, 1, 2), repeat=3):
+            wanted[tuple(slice(o, o + 2 * n, 2) for o, n in zip(offset, cells))] |= near
+        wanted &= ~known
+        stride, cells = stride // 2, 2 * cells
 
-    def exact(index: Int[np.ndarray, "p 3"]) -> Float[np.ndarray, "p"]:
-        return signed_distance(low + spacing * index, points, normals, width, tree)
 
-    corners = np.stack(np.meshgrid(*(np.arange(n + 1) for n in cells), indexing="ij"), -1).reshape(-1, 3)
-    coarse = exact(_COARSE * corners).reshape(cells + 1)
-    fine = coarse
+def _halfway(values: Float[np.ndarray, "x y z"]) -> Float[np.ndarray, "u v w"]:
+    """The lattice with a sample midway between each two, their mean."""
     for axis in range(3):
-        at = np.arange(_COARSE * cells[axis] + 1) / _COARSE
-        below = np.minimum(at.astype(int), max(cells[axis] - 1, 0))
-        share = (at - below).reshape([-1 if k == axis else 1 for k in range(3)])
-        above = np.minimum(below + 1, cells[axis])
-        fine = (1 - share) * fine.take(below, axis) + share * fine.take(above, axis)
-    reach = (_COARSE * np.sqrt(3) / 2 + 1) * spacing  # no point of a cell is further from the nearest of its corners
-    near = ndimage.minimum_filter(np.abs(coarse), 2, origin=-1)[tuple(slice(n) for n in cells)] <= reach
-    inner = np.stack(np.meshgrid(*[np.arange(_COARSE + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    wanted = np.zeros(fine.shape, bool)
-    for offset in inner:
-        wanted[tuple(slice(o, o + _COARSE * n, _COARSE) for o, n in zip(offset, cells))] |= near
-    index = np.argwhere(wanted)
-    fine[tuple(index.T)] = exact(index)
-    return fine[tuple(slice(n) for n in shape)]
+        values = np.moveaxis(values, axis, 0)
+        finer = np.empty((2 * len(values) - 1, *values.shape[1:]))
+        finer[::2], finer[1::2] = values, (values[1:] + values[:-1]) / 2
+        values = np.moveaxis(finer, 0, axis)
+    return values
 
 
 def signed_distance(
@@ -170,8 +181,10 @@ def _plane(
     reach = np.maximum(width, 0.5 * gap[:, :1])
     weights = np.exp(-(gap**2 - gap[:, :1] ** 2) / (2 * reach**2))
     weights = weights / weights.sum(1, keepdims=True)
-    centre = np.einsum("pk,pkj->pj", weights, points[nearest])
-    normal = np.einsum("pk,pkj->pj", weights, normals[nearest])
+    # a sparse product copies no 64 points and normals for each row
+    ends = np.arange(len(at) + 1) * weights.shape[1]
+    average = csr_array((weights.ravel(), nearest.ravel(), ends), shape=(len(at), len(points)))
+    centre, normal = average @ points, average @ normals
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     # between two sides the normals cancel: there the normal of the nearest point is used
     normal = np.where(length > 0.1, normal / np.maximum(length, 0.1), normals[nearest[:, 0]])

@@ -5,13 +5,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
+from typer.testing import CliRunner
 
 from benchmarks.segmentation.association import score, spoil
 from benchmarks.segmentation.tabletop import load_tabletop
+from pigjax import io
+from pigjax.cli import app, segmenting
 from pigjax.core.camera import orbit
 from pigjax.core.errors import InputError
 from pigjax.objects.association import associate_masks, compact_ids
-from pigjax.segmentation import lift_masks
+from pigjax.segmentation import Labels, lift_masks
 from pigjax.splat import Gaussians
 
 SIZE, VIEWS, FOCAL, DISTANCE, RADIUS = 48, 8, 60.0, 4.0, 0.7
@@ -77,6 +80,35 @@ def test_shuffled_ids_become_consistent_and_lift_as_true_masks_do():
     assert same_partition(np.asarray(labels.object_id) + 1, np.asarray(expected.object_id) + 1)
     again = associate_masks(BALLS, CAMERAS, shuffled(TRUTH))
     np.testing.assert_array_equal(again.masks, found.masks)
+
+
+def test_the_command_links_masks_whose_ids_differ_from_view_to_view(tmp_path, monkeypatch):
+    given = []
+
+    def lifted(gaussians, cameras, masks, **options):
+        given.append(masks)
+        return Labels(np.repeat([1, 2], len(gaussians) // 2), np.zeros((len(gaussians), 3)), np.ones(len(gaussians)))
+
+    monkeypatch.setattr(segmenting, "lift", lifted)  # spares the compilation; test_editing runs the whole command
+    monkeypatch.setattr(segmenting, "_sheet", lambda *_: np.zeros((4, 4, 3)))
+    io.save_ply(tmp_path / "balls.ply", BALLS)
+    names = [f"{index}" for index in range(VIEWS)]
+    poses = np.linalg.inv(np.asarray(CAMERAS.world_to_cam, float)) @ np.diag([1, -1, -1, 1])
+    frames = [
+        {"file_path": f"images/{n}.png", "transform_matrix": pose.tolist(), "split": "train"}
+        for n, pose in zip(names, poses)
+    ]
+    intrinsics = {"fl_x": FOCAL, "cx": SIZE / 2, "cy": SIZE / 2, "w": SIZE, "h": SIZE}
+    io.write_json(tmp_path / "transforms.json", intrinsics | {"frames": frames})
+    for name in names:
+        io.write_image(tmp_path / "images" / f"{name}.png", np.zeros((SIZE, SIZE, 3)))
+    io.save_masks(tmp_path / "object_mask", names, shuffled(TRUTH))
+    command = ["segment", str(tmp_path / "balls.ply"), str(tmp_path), "-o", str(tmp_path / "out"), "--associate"]
+    assert CliRunner().invoke(app, command, catch_exceptions=False).exit_code == 0
+    assert len(np.unique(given[0])) == 3
+    assert same_partition(given[0], TRUTH)
+    labels = io.load_labels(tmp_path / "out" / "labels.npz", len(BALLS))
+    np.testing.assert_array_equal(labels.object_id, np.repeat([1, 2], len(BALLS) // 2))
 
 
 def test_the_object_with_most_sightings_is_number_one():
