@@ -108,9 +108,10 @@ def make_own_splats(
     tree = cKDTree(points)
     gap, carrier = tree.query(np.asarray(pieces.means))
     near = gap < _NEAR * dx
-    pieces, carrier = jax.tree.map(lambda values: values[near], pieces), carrier[near]
+    # on the host: arrays of so many sizes would each compile what cuts and joins them
+    pieces, carrier = jax.tree.map(lambda values: np.asarray(values)[near], pieces), carrier[near]
     inner, of_inner = _inside(pieces, gaussians, points, np.bincount(carrier, minlength=len(points)), dx, inside)
-    own = jax.tree.map(lambda *parts: jnp.concatenate(parts), pieces, inner)
+    own = jax.tree.map(lambda *parts: jnp.asarray(np.concatenate(parts)), pieces, inner)
     carrier = np.concatenate([carrier, of_inner])
     own = _within(own, dx)
     if not steps or not len(own):
@@ -177,7 +178,7 @@ def _inside(
         means=jnp.asarray(points[rows], kind),
         log_scales=jnp.asarray(np.repeat(np.log(size)[:, None], 3, 1), kind),
         quats=jnp.asarray(np.tile([1.0, 0, 0, 0], (count, 1)), kind),
-        logit_opacities=jnp.full(count, _INNER_LOGIT, kind),
+        logit_opacities=jnp.asarray(np.full(count, _INNER_LOGIT), kind),
         sh=jnp.asarray(sh, kind),
     ), rows
 
@@ -202,7 +203,7 @@ def _refitted(
     own: Gaussians, truth: Gaussians, cameras: Camera, dx: float, steps: int
 ) -> tuple[Gaussians, float, float]:
     """Splats fitted to pictures of the truth, and the PSNR in held-out views before and after [dB]."""
-    count, kind = len(cameras), own.means.dtype
+    count, kind, cameras = len(cameras), own.means.dtype, jax.tree.map(np.asarray, cameras)
     held = [k for k in range(count) if k % 5 == 2] or [0]
     train = [k for k in range(count) if k not in held] or [0]
     # the number of rows is a power of two, so that objects of about the same size share the program
@@ -227,7 +228,8 @@ def _refitted(
         # backgrounds are random greys, so that what is seen through counts
         given = jnp.asarray([random.uniform(), _LAST ** (number / steps)], kind)
         fit, _ = _step(fit, cameras[view], targets[view], given, jnp.asarray(True))
-    return jax.tree.map(lambda values: values[: len(own)], fit.own), score(start), score(fit)
+    fitted = jax.tree.map(lambda values: jnp.asarray(np.asarray(values)[: len(own)]), fit.own)
+    return fitted, score(start), score(fit)
 
 
 def _padded(gaussians: Gaussians, rows: int) -> Gaussians:
