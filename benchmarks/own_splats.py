@@ -33,7 +33,7 @@ SCORES = "PSNR", "SSIM", "holes %", "spill %", "needles %", "longest [cells]", "
 # of part laws; soft enough for long steps, and stiff against the weight of a heap, 1 kPa
 LAWS = {
     "sand": dataclasses.replace(pj.preset("sand"), young=1e5),
-    "snow": pj.preset("snow"),
+    "snow": dataclasses.replace(pj.preset("snow"), young=5e4),
     "water": dataclasses.replace(pj.preset("water"), bulk_modulus=3e4),
 }
 FALLS, DROP = 0.24, 0.03  # time [s] and height above the floor [m] of part laws
@@ -117,7 +117,7 @@ def laws(options):
     """Table of an object that falls on a floor under three laws, beside parts of it that matter carries one by one."""
     print(head("law", "splats", *SCORES))
     gaussians, _, made, _ = _subjects(options)[options.objects[-1]]
-    ids, parts = np.ones(len(gaussians), int), split(gaussians, 0.5 * options.dx)
+    ids, parts = np.ones(len(gaussians), int), split(gaussians, 0.6 * options.dx)
     shown = []
     for law, material in LAWS.items():
         # the same places under every law

@@ -147,7 +147,7 @@ def with_own(
             continue
         members = np.flatnonzero(object_id == inputs.ids[name])
         mine = jax.tree.map(lambda values, members=members: values[members], inputs.gaussians)
-        settings = {} if entry.refit else {"steps": 0}
+        settings: dict[str, Any] = {} if entry.refit else {"steps": 0}
         mark = io.digest(mine, x[rows], plan.dx, entry.inside, settings, make_own_splats)
         made = _stored(stored or {}, f"{MADE}_{number}", mark)
         if made is None:
