@@ -31,7 +31,7 @@ from pigjax.core.checks import Limits
 from pigjax.mpm.materials import LAWS, PRESETS, Parameters, material_table, preset
 from pigjax.mpm.materials.table import LIMITS
 from pigjax.scene.decode import Section, numbers_of, sections_of, wanted
-from pigjax.scene.schema import ObjectSpec, Scene, SimulationSpec
+from pigjax.scene.schema import ObjectSpec, Scene, SimulationSpec, VolumeSpec
 from pigjax.study.schema import OPTIONS, Study
 
 ROOT = Path(__file__).parents[1]
@@ -78,7 +78,7 @@ def rows_of(kind: type[Section]) -> Iterator[Row]:
     if issubclass(kind, ObjectSpec):
         limits |= {name: limit for name, (_, limit) in LIMITS.items() if name in limits}
     for field in fields(kind):
-        if field.name in FROM_OUTSIDE:
+        if field.name in FROM_OUTSIDE or field.name in refused(kind):
             continue
         limit = limits.get(field.name)
         meaning = meaning_of(kind, field.name)
@@ -89,6 +89,11 @@ def rows_of(kind: type[Section]) -> Iterator[Row]:
             meaning = meaning.removesuffix(f" [{unit}]")
         default = "of the material" if issubclass(kind, ObjectSpec) and field.name in LIMITS else _default(field)
         yield Row(field.name, _type(field.type), default, unit, bounds, meaning)
+
+
+def refused(kind: type[Section]) -> tuple[str, ...]:
+    """Fields that a volume inherits and refuses."""
+    return (*kind.of_captured, "splats") if issubclass(kind, VolumeSpec) else ()
 
 
 def _range(limit: Limits) -> str:
@@ -121,6 +126,8 @@ def _default(field: Any) -> str:
 def sections(kind: type[Section], above: str = "") -> Iterator[tuple[str, type[Section]]]:
     """Tables of a file as they are headed, `[objects.NAME]`, and their structs; tables within tables after them."""
     for field in fields(kind):
+        if field.name in refused(kind):
+            continue
         own, name = field.type, f"{above}{field.name}"
         if get_origin(own) is dict:
             own, name = get_args(own)[1], f"{name}.NAME"

@@ -1,6 +1,7 @@
-"""Rigid bodies: how deep they sink by the rounds of contact, and what a body costs beside other matter.
+"""Rigid bodies: how deep they sink by the rounds of contact and in water, and what a body costs beside other matter.
 
 rounds: a box falls tilted onto a floor, with few rounds of contact and with many: depth, tilt and time a substep.
+floating: a block of wood in a tank, by cells: the share of it under the water's level, beside that of Archimedes.
 cost: water alone, with a block of jelly in one velocity field and apart from it, and with a rigid block.
 """
 
@@ -10,7 +11,7 @@ import numpy as np
 from benchmarks.common.pages import head, row
 from benchmarks.common.timing import in_turn
 from pigjax import Material, SimConfig, material_table, rollout
-from pigjax.mpm import Grid, make_particles
+from pigjax.mpm import WALL, Grid, make_particles
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.contact import BodyContact
 
@@ -19,6 +20,7 @@ FLOOR = Plane(point=(0.0, 0.0, 0.25), normal=(0.0, 0.0, 1.0), friction=0.5)
 RIGID = Material("rigid", density=600.0)
 JELLY = Material("neo_hookean", density=600.0, young=1e5, poisson=0.3)
 WATER = Material("fluid", density=1000.0, bulk_modulus=5e4, viscosity=0.5)
+STIFF_WATER = Material("fluid", density=1000.0, bulk_modulus=2e5, viscosity=0.5)  # its weight presses it by 1 %
 
 
 def lattice(size, low, spacing):
@@ -48,7 +50,7 @@ def rounds(options):
             colliders=(FLOOR,),
         )[1]  # fmt: skip
 
-    found = in_turn({str(count): (lambda count=count: run(count)) for count in options.rounds}, windows=5)
+    found = in_turn({str(count): (lambda count=count: run(count)) for count in options.rounds}, windows=2)
     print(head("rounds", "deepest [cells]", "at rest [cells]", "speed at rest [m/s]", "ms a substep", "times 20"))
     for name, timed in found.items():
         path = timed.result
@@ -58,6 +60,46 @@ def rounds(options):
         ratio = f"{timed.over(found['20']):.2f}" if "20" in found else ""
         each = f"{timed.seconds / (frames * steps) * 1e3:.2f}"
         print(row(name, f"{depth.max():.3f}", f"{depth[-1]:.3f}", f"{speed:.4f}", each, ratio))
+
+
+def floating(options):
+    """A block as wide as half of the tank, in a slice of four cells from wall to wall, over two seconds from rest."""
+    side, depth, wide, high, sunk = 0.6, 0.3, 0.3, 0.2, 0.1
+    wanted = float(RIGID.density / WATER.density)
+    print(head("cells across the tank", "particles", "steps", "share under water", "least, most", "of that wanted"))
+    for cells in options.across:
+        dx = side / cells
+        low = (WALL - 1) * dx  # the last node that the walls hold
+        water = lattice((side, 4 * dx, depth), (low,) * 3, dx / 2)
+        start = np.array([low + (side - wide) / 2, low, low + depth - sunk])
+        size = np.array([wide, 4 * dx, high])
+        block = lattice(size, start, dx / 2)
+        water = water[~((water > start) & (water < start + size)).all(1)]
+        row_of = np.repeat([0, 1], [len(water), len(block)])
+        table = material_table([STIFF_WATER, RIGID])
+        particles = make_particles(
+            jnp.asarray(np.concatenate([water, block]), jnp.float32), volume=(dx / 2) ** 3, table=table,
+            material=row_of, body=row_of,
+        )  # fmt: skip
+        nodes = (cells + 2 * WALL - 1, 4 + 2 * WALL - 1, round((depth + high) / dx) + 2 * WALL)
+        frames, steps = 50, round(0.04 / (0.02 * dx))
+        path = rollout(
+            particles, Grid(jnp.zeros(3), jnp.asarray(dx), nodes), table,
+            SimConfig(substeps=steps, devices=1, walls="separate"), frames=frames, frame_dt=0.04,
+            gravity=(0.0, 0.0, -9.81), contact=BodyContact(bodies=2),
+        )[1]  # fmt: skip
+        x = np.asarray(path.x)[frames // 2 :] - low
+        pool, bottoms = x[:, row_of == 0], x[:, row_of == 1, 2].mean(1) - high / 2
+        apart = np.abs(pool[..., 0] - side / 2) > wide / 2 + dx / 2
+        levels = 2 * np.stack([own[there, 2].mean() for own, there in zip(pool, apart)])
+        under = (levels - bottoms) / high
+        spread = f"{under.min():.3f}, {under.max():.3f}"
+        each = f"{under.mean():.3f}", spread, f"{under.mean() / wanted:.3f}"
+        print(row(cells, len(particles), frames * steps, *each))
+    return (
+        f"\nWanted: {wanted:.2f}. Means, least and most of the second half of 2 s; the water's level is twice the mean "
+        "height of what is apart from the block."
+    )
 
 
 def cost(options):
@@ -106,9 +148,14 @@ def _afloat(cells, block, apart):
     return run
 
 
-PARTS = {"rounds": ("Rounds of contact", rounds), "cost": ("Cost of a rigid body", cost)}
+PARTS = {
+    "rounds": ("Rounds of contact", rounds),
+    "floating": ("A block that floats", floating),
+    "cost": ("Cost of a rigid body", cost),
+}
 OPTIONS = {
     "rounds": {"nargs": "+", "type": int, "default": [2, 5, 10, 20, 40], "help": "of contact"},
-    "cells": {"nargs": "+", "type": int, "default": [12, 24, 48], "help": "of the pool along a side"},
+    "across": {"nargs": "+", "type": int, "default": [6, 12, 18], "help": "cells of the tank, multiples of 6"},
+    "cells": {"nargs": "+", "type": int, "default": [12, 24], "help": "of the pool along a side"},
     "windows": {"type": int, "default": 5, "help": "runs of each"},
 }

@@ -46,7 +46,7 @@ from pigjax.core.arrays import is_compiling, is_known
 from pigjax.core.errors import InputError
 from pigjax.core.regions import Region
 from pigjax.mpm import Grid, Health, Particles, SimConfig, StepHealth, Trajectory
-from pigjax.mpm.active_grid import choose_box
+from pigjax.mpm.active_grid import box_at_trace, choose_box
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.contact import BodyContact, broken_by
 from pigjax.mpm.forces import Force, check_forces
@@ -153,9 +153,9 @@ def rollout(
 
     With concrete arrays, only the active part of the grid is allocated; a domain of at most 50,000 nodes is held whole
     unless `sleep` is given. Inside jit, grad and vmap the whole grid is allocated, or a window of `config.box` nodes
-    that moves with matter (`choose_box` finds it): give a grid that `fit_grid` has fitted. Reverse mode keeps O(√n)
-    checkpoints of n steps, at least one for each frame, and recomputes the states between them (Griewank and Walther
-    2000); with a window it also keeps the inputs of each frame.
+    that moves with matter ("auto" sizes it by the positions at the start, `choose_box` by a rollout): give a grid that
+    `fit_grid` has fitted. Reverse mode keeps O(√n) checkpoints of n steps, at least one for each frame, and recomputes
+    the states between them (Griewank and Walther 2000); with a window it also keeps the inputs of each frame.
 
     Args:
         particles: p of them, in any order of materials.
@@ -200,10 +200,14 @@ def rollout(
             )
         if config.integrator == "auto":
             raise InputError(f"rollout {_UNDECIDED}")
-        _warn_of_empty_nodes(grid, len(particles), config)
-        dt = jnp.asarray(frame_dt) / config.substeps
+        substeps = config.substeps
+        if config.box == "auto":
+            config = replace(config, box=box_at_trace(particles, table, grid))
+        else:
+            _warn_of_empty_nodes(grid, len(particles), config)
+        dt = jnp.asarray(frame_dt) / substeps
         return _compiled(
-            particles, grid, table, config, dt, gravity, colliders, contact, pins, forces, frames, config.substeps
+            particles, grid, table, config, dt, gravity, colliders, contact, pins, forces, frames, substeps
         )
     rule = substep_rule(
         particles,
@@ -276,8 +280,8 @@ def _warn_of_empty_nodes(grid: Grid, particles: int, config: SimConfig) -> None:
     if config.box is None and nodes > max(_SMALL, _EMPTY * particles):
         warnings.warn(
             f"rollout is traced by jit, grad or vmap and visits all {nodes} nodes of its grid in each step, for"
-            f" {particles} particles: give SimConfig the box that choose_box finds from one rollout outside, or fit the"
-            " grid with fit_grid.",
+            f" {particles} particles: give SimConfig(box='auto') where their positions are known while tracing, else"
+            " the box that choose_box finds from one rollout outside, or fit the grid with fit_grid.",
             stacklevel=3,
         )
 

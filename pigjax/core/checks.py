@@ -111,13 +111,16 @@ def check_fields(thing: Any) -> None:
         wanted = str(field.type).split(" | ")
         if isinstance(value, jax.core.Tracer) or (value is None and "None" in wanted):
             continue
+        words = [kind.partition("Literal[")[2].strip("'\"]") for kind in wanted if "Literal[" in kind]
+        if isinstance(value, str) and value in words:
+            continue
         if choices is not None:
             if not isinstance(value, str | None) or value not in choices:
                 raise InputError(f"{name} = {shown(value)}: {suggest(value, choices)}.")
             continue
         kind = next((kind for kind in wanted if kind != "None"), "")
         if not _is(value, kind) or _misshapen(value, kind):
-            raise InputError(f"{name} = {shown(value)}: must be {_wanted(kind)}.")
+            raise InputError(f"{name} = {shown(value)}: must be {' or '.join([_wanted(kind), *map(repr, words)])}.")
         if kind in ("int", "float") or limits is not None or kind.startswith(("Float", "tuple")):
             rule = (limits or (_WHOLE if kind == "int" else ANY)).broken(value)
             if rule is not None:

@@ -40,6 +40,7 @@ _OFF = 1.0  # spacings above the surface from which a Gaussian stands on it
 _LEAST_RIM, _MOST_RIM = 5, 24  # width of the surface around the outline of the others that is looked at [spacings]
 _FAR = 0.75  # of that width, beyond which no shadow is expected
 _SECTORS = 24  # of the directions in which there must be known surface around a point
+_TOGETHER = 1_000_000  # pairs of nodes and points at a time, to bound memory
 _LINKS = 8  # neighbours in the graph of the surface
 _SHADE = 0.94  # of the luminance expected; darker may be shadow
 _SAME = 0.04  # difference of colours that are the same: what occurs far from the others is texture
@@ -304,11 +305,15 @@ def _seen_from_outside(
     order = np.lexsort((-height, node))
     order = order[np.abs(height[order]) <= _LAYER * patch.spacing]
     node, row, offset = node[order], row[order], offset[order]
-    planes = np.stack([direction[node] for direction in _tangents(patch.normals)], 1)
-    spread = np.einsum("pai,pij->paj", planes, shell.axes[row])
-    covariance = np.einsum("paj,pbj->pab", spread, spread) + (0.05 * patch.spacing) ** 2 * np.eye(2)
-    across = np.einsum("pai,pi->pa", planes, offset)
-    fall = np.einsum("pa,pa->p", across, np.linalg.solve(covariance, across[..., None])[..., 0])
+    one, two = (direction[node] for direction in _tangents(patch.normals))
+    axes = shell.axes[row]
+    # covariance across the normal, and the fall of the Gaussian, written out: numpy's small matrices are slow
+    first, second = (np.einsum("pi,pij->pj", direction, axes) for direction in (one, two))
+    softened = (0.05 * patch.spacing) ** 2
+    xx, yy = (np.einsum("pj,pj->p", part, part) + softened for part in (first, second))
+    xy = np.einsum("pj,pj->p", first, second)
+    x, y = (np.einsum("pi,pi->p", direction, offset) for direction in (one, two))
+    fall = (yy * x * x - 2 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
     alpha = np.minimum(shell.opacities[row] * np.exp(-0.5 * fall), 0.99)
     depth = np.cumsum(np.log1p(-alpha))
     begins = np.searchsorted(node, np.arange(len(patch.nodes) + 1))
@@ -331,17 +336,21 @@ def _enclosed(patch: _Patch, known: Bool[np.ndarray, "q"], beyond: Float[np.ndar
     there = np.concatenate([patch.nodes[known], beyond])
     there = there[_thin(there, 3 * patch.spacing)]
     result = known.copy()
-    for index in np.flatnonzero(~known):
-        offset = there - patch.nodes[index]
-        height = np.einsum("bi,i->b", offset, patch.normals[index])
-        one, two = _tangents(patch.normals[index][None])
-        flat = np.abs(height) < 0.5 * np.linalg.norm(offset, axis=1)
-        angle = np.arctan2(np.einsum("bi,i->b", offset[flat], two[0]), np.einsum("bi,i->b", offset[flat], one[0]))
-        full = np.zeros(_SECTORS, bool)
-        full[np.floor((angle / (2 * np.pi) % 1) * _SECTORS).astype(int) % _SECTORS] = True
-        at = np.flatnonzero(full)
-        gaps = np.diff(np.append(at, at[:1] + _SECTORS)) - 1  # empty sectors between full ones
-        result[index] = len(at) > 0 and gaps.max(initial=0) < _SECTORS // 2
+    one, two = _tangents(patch.normals)
+    asked = np.flatnonzero(~known)
+    for chosen in np.array_split(asked, max(1, len(asked) * len(there) // _TOGETHER)):
+        offset = there - patch.nodes[chosen, None]
+        height, x, y = (np.einsum("qbi,qi->qb", offset, axis[chosen]) for axis in (patch.normals, one, two))
+        flat = np.abs(height) < 0.5 * np.sqrt(height**2 + x**2 + y**2)
+        sector = np.floor((np.arctan2(y, x) / (2 * np.pi) % 1) * _SECTORS).astype(int) % _SECTORS
+        full = np.zeros((len(chosen), _SECTORS), bool)
+        full[np.nonzero(flat)[0], sector[flat]] = True
+        empty = np.zeros(len(chosen), int)  # sectors in a row, over the end too
+        longest = empty
+        for column in np.concatenate([full, full], 1).T:
+            empty = np.where(column, 0, empty + 1)
+            longest = np.maximum(longest, empty)
+        result[chosen] = longest < _SECTORS // 2
     return result
 
 

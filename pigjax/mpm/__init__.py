@@ -9,7 +9,7 @@ from pigjax.mpm.grid import (
     vast_grid,
 )
 from pigjax.mpm.health import Health, StepHealth
-from pigjax.mpm.layout import State, inverse, tile_order, to_chunks, to_rows
+from pigjax.mpm.layout import State, chunk_size, inverse, reorder, tile_order, to_chunks, to_rows
 from pigjax.mpm.particles import Particles, Trajectory, make_particles
 
 __all__ = [
@@ -24,10 +24,12 @@ __all__ = [
     "StepHealth",
     "Trajectory",
     "bound_visual",
+    "chunk_size",
     "fit_grid",
     "group_by_law",
     "inverse",
     "make_particles",
+    "reorder",
     "tile_order",
     "to_chunks",
     "to_rows",

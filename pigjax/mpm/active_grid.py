@@ -20,8 +20,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float
 
 from pigjax.core.arguments import checked
-from pigjax.core.arrays import Vector
-from pigjax.core.errors import SimulationError
+from pigjax.core.arrays import Vector, is_known
+from pigjax.core.errors import InputError, SimulationError
 from pigjax.mpm import WALL, Grid, Health, Particles, SimConfig, Trajectory
 from pigjax.mpm.materials import LAWS, MaterialTable
 from pigjax.mpm.program import AXIS, GridWindow, StepInputs, run_frames
@@ -29,6 +29,7 @@ from pigjax.mpm.program import AXIS, GridWindow, StepInputs, run_frames
 LARGEST = 200_000_000  # nodes
 _ROOM = 1.4  # factor on the sides that a window needs: another size is another compilation
 _ROOM_OF_ONE = 1.15  # the same for a window of fixed size, for motion that is faster than the runs that sized it
+_ROOM_AT_TRACE = 1.5  # the same where only the start is known
 _UNIT = 4  # nodes, of which sides are multiples
 _AROUND = 6  # nodes a side of a window of fixed size beyond the extent of matter: the kernel's, and some room
 _PER_DEVICE = 4096  # particles that are worth a device of their own
@@ -130,8 +131,7 @@ def box_for(
                 middle = (both.min(0) + both.max(0)) / 2
                 half = np.maximum(half, np.abs(np.concatenate([both, there]) - middle).max(0))
     needed = np.ceil(2 * half / float(domain.dx)) + _AROUND
-    nx, ny, nz = map(int, np.clip(np.ceil(needed * _ROOM_OF_ONE), 2 * WALL + 2, domain.shape))
-    return (nx, ny, nz) if 2 * _nodes((nx, ny, nz)) <= _nodes(domain.shape) else None
+    return _box(domain, needed * _ROOM_OF_ONE)
 
 
 @checked
@@ -165,6 +165,39 @@ def choose_box(
         Nodes a side, with 15 % more than the rollout used; None where a box would hold more than half of the domain.
     """
     return box_for([(particles, path, float(frame_dt), gravity)], table, grid)
+
+
+def box_at_trace(particles: Particles, table: MaterialTable, domain: Grid) -> tuple[int, int, int] | None:
+    """The box of `SimConfig(box="auto")`: the extents of moving matter at the start, with half as much beside.
+
+    Args:
+        particles: at the start; only their positions need be known.
+        table: materials.
+        domain: the whole grid.
+
+    Returns:
+        Nodes a side; None where a box would hold more than half of the domain.
+
+    Raises:
+        InputError: the positions or the grid are traced.
+    """
+    if not is_known((particles.x, particles.material, domain)):
+        raise InputError(
+            "SimConfig.box = 'auto' needs positions and a grid that are known while tracing: close over them instead of"
+            " passing them to jit, grad or vmap, or give the box that choose_box finds."
+        )
+    with jax.ensure_compile_time_eval():
+        moving = np.asarray(_moving(particles, table))
+    x = np.asarray(particles.x)[moving]
+    x = x[np.isfinite(x).all(-1)]
+    extents = np.ptp(x, axis=0) if len(x) else np.zeros(3)
+    return _box(domain, _ROOM_AT_TRACE * extents / float(domain.dx) + _AROUND)
+
+
+def _box(domain: Grid, needed: Float[np.ndarray, "3"]) -> tuple[int, int, int] | None:
+    """Nodes a side of a box, None where it would hold more than half of the domain."""
+    nx, ny, nz = map(int, np.clip(np.ceil(needed), 2 * WALL + 2, domain.shape))
+    return (nx, ny, nz) if 2 * _nodes((nx, ny, nz)) <= _nodes(domain.shape) else None
 
 
 def window_around(

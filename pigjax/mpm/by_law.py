@@ -13,12 +13,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from pigjax.core import linalg
 from pigjax.core.errors import InputError
 from pigjax.mpm.grid import Grid
-from pigjax.mpm.layout import State, inverse, order_of
+from pigjax.mpm.layout import State, inverse, order_of, reorder
 from pigjax.mpm.materials import LAWS, MaterialTable, Parameters, respond
 from pigjax.mpm.particles import Particles, Trajectory
 
@@ -103,7 +103,7 @@ def group_by_law(
         order = order_of(rank[particles.material], len(laws) + 1)
 
     counts = [sizes[law] for law in laws]
-    parts = _split(particles if order is None else _reorder(particles, order), counts)
+    parts = _split(particles if order is None else reorder(particles, order), counts)
     own = [None] * len(laws) if weights is None else _split(weights if order is None else weights[order], counts)
     moves = [LAWS[law].respond is not None for law in laws]
     pairs = [
@@ -126,13 +126,17 @@ def by_row(tensors: Array) -> Array:
     return tensors.reshape(9, -1)
 
 
-def bound_visual(state: State, stretch: tuple[float, float]) -> State:
-    """State with the stretches of F_visual clipped: unbounded flow would otherwise be drawn as needles."""
-    if state.visual is None:
-        return state
-    u, s, v = linalg.svd(state.visual.reshape(-1, 3, 3))
+def bound_visual(states: tuple[State, ...], stretch: tuple[float, float]) -> tuple[State, ...]:
+    """States with the stretches of F_visual clipped: unbounded flow would otherwise be drawn as needles."""
+    apart = [k for k, state in enumerate(states) if state.visual is not None]
+    if not apart:
+        return states
+    visual = [states[k].visual for k in apart]
+    u, s, v = linalg.svd(jnp.concatenate(visual).reshape(-1, 3, 3))  # of all at once: one program, not one for each
     s = jnp.clip(s, *stretch)
-    return state._replace(visual=linalg.matmul3(u * s[..., None, :], linalg.transpose(v)).reshape(-1, 9))
+    bounded = linalg.matmul3(u * s[..., None, :], linalg.transpose(v)).reshape(-1, 9)
+    parts = dict(zip(apart, jnp.split(bounded, np.cumsum([len(rows) for rows in visual])[:-1])))
+    return tuple(state._replace(visual=parts[k]) if k in parts else state for k, state in enumerate(states))
 
 
 def _group(
@@ -238,7 +242,3 @@ def _own_grid(part: Particles, grid: Grid) -> Float[Array, "p 3"]:
 def _split(rows: Any, sizes: list[int]) -> list[Any]:
     ends = np.cumsum(sizes)
     return [jax.tree.map(lambda a, low=end - size, high=end: a[low:high], rows) for size, end in zip(sizes, ends)]
-
-
-def _reorder(particles: Particles, order: Int[Array, "p"]) -> Particles:
-    return jax.tree.map(lambda array: array[order], particles)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import equinox as eqx
 import jax
 
@@ -47,8 +49,9 @@ class SimConfig(eqx.Module):
     krylov_steps: int = static_field(default=300, limits=Limits(1, 1_000_000))  # of a Newton step, at most
     # in which contact of rigid bodies is solved, in each step: fewer let stacks sink
     contact_rounds: int = static_field(default=20, limits=Limits(1, 1_000_000))
-    # nodes of a window that moves with matter in jit, grad and vmap
-    box: tuple[int, int, int] | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
+    # nodes of a window that moves with matter in jit, grad and vmap; None: the whole grid; "auto": half as large again
+    # as the matter at the start, whose positions must be known while tracing. Matter that outruns it counts as escaped
+    box: tuple[int, int, int] | Literal["auto"] | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
     # that share the particles; None: all local ones, where there are enough particles
     devices: int | None = static_field(default=None, limits=Limits(1, 100_000))
     # or "forward": for jvp, jacfwd and hessian
@@ -68,13 +71,10 @@ class SimConfig(eqx.Module):
     def __check_init__(self) -> None:
         check_fields(self)
         check_backend("SimConfig", self.backend, self.differentiation)
-        if self.box is not None and not (
-            isinstance(self.box, tuple)
-            and len(self.box) == 3
-            and all(isinstance(side, int) for side in self.box)
-            and min(self.box) >= 2 * WALL + 2
-        ):
-            raise InputError(f"SimConfig.box = {self.box}: give three sides of {2 * WALL + 2} nodes or more.")
+        if isinstance(self.box, tuple) and min(self.box) < 2 * WALL + 2:
+            raise InputError(
+                f"SimConfig.box = {self.box}: give three sides of {2 * WALL + 2} nodes or more, or 'auto'."
+            )
         if len(self.visual_stretch) != 2 or self.visual_stretch[0] > self.visual_stretch[1]:
             raise InputError(
                 f"SimConfig.visual_stretch = {self.visual_stretch}: the bounds must be > 0, the lower one first."

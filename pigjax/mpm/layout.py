@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 _TILE = 4  # cells a side: particles of one tile are neighbours
 _LANES = 16  # of a machine vector
 _PARTICLES = 512  # of a chunk on a CPU: their windows fit its second-level cache
+_OVERHEAD = 32  # of a turn of the loop over chunks, in particles
 
 
 Rows: TypeAlias = Any  # an array, or None where the law does not need it
@@ -35,14 +38,36 @@ class State(NamedTuple):
     weights: Rows = None  # by the forces that weight particles, one each; None where no force does
 
 
-def to_chunks(state: State, limit: int | None) -> State:
-    """State in chunks of at most `limit` particles, the last particle repeated without mass; None: 512 on a CPU."""
-    if limit is None and jax.default_backend() == "cpu":
+def chunk_size(counts: Sequence[int], limit: int | None) -> int | None:
+    """Particles of a chunk, the same for all laws so that they share a loop; None: each law is one chunk.
+
+    The size is that of one of the laws alone, and is the cheapest for all of them with what they must be padded by.
+
+    Args:
+        counts: particles of each law.
+        limit: largest size; None: 512 on a CPU, whole laws elsewhere.
+    """
+    if limit is None:
+        if jax.default_backend() != "cpu":
+            return None
         limit = _PARTICLES
+
+    def alone(count):
+        chunks = -(-count // limit)
+        size = -(-count // chunks)
+        return -(-size // _LANES) * _LANES if chunks > 1 else size
+
+    def cost(size):
+        return sum(-(-count // size) * (size + _OVERHEAD) for count in counts)
+
+    return min((alone(count) for count in counts if count), key=cost, default=None)
+
+
+def to_chunks(state: State, size: int | None) -> State:
+    """State in chunks of `size` particles, the last particle repeated without mass; None: one chunk."""
     count = len(state.cells)
-    chunks = -(-count // (limit or count))
-    size = -(-count // chunks)
-    size = -(-size // _LANES) * _LANES if chunks > 1 else size
+    size = count if size is None else size
+    chunks = -(-count // size)
     padding = chunks * size - count
 
     def chunked(rows):
@@ -77,6 +102,21 @@ def order_of(keys: Int[Array, "p"], most: int) -> Int[Array, "p"]:
     if most * count >= 2**32:
         return lax.sort_key_val(keys, index.astype(jnp.int32))[1]  # which is stable
     return (jnp.sort(keys.astype(jnp.uint32) * count + index) % count).astype(jnp.int32)
+
+
+def reorder(rows: Any, order: Int[Array, "p"], axis: int = 0) -> Any:
+    """Arrays `[.. p r]` with their particles in another order; those of one type move together, in one gather."""
+    leaves, structure = jax.tree.flatten(rows)
+    moved: list[Any] = [None] * len(leaves)
+    for dtype in dict.fromkeys(leaf.dtype for leaf in leaves):
+        own = [k for k, leaf in enumerate(leaves) if leaf.dtype == dtype]
+        flat = [leaves[k].reshape(*leaves[k].shape[: axis + 1], -1) for k in own]
+        packed = jnp.concatenate(flat, -1)
+        packed = jnp.take(packed, order, axis, mode="clip")
+        ends = np.cumsum([part.shape[-1] for part in flat])[:-1]
+        for k, part in zip(own, jnp.split(packed, ends, -1)):
+            moved[k] = part.reshape(leaves[k].shape)
+    return jax.tree.unflatten(structure, moved)
 
 
 def inverse(order: Int[Array, "p"]) -> Int[Array, "p"]:

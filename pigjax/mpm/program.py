@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,8 +27,10 @@ from pigjax.mpm import (
     StepHealth,
     Trajectory,
     bound_visual,
+    chunk_size,
     group_by_law,
     inverse,
+    reorder,
     tile_order,
     to_chunks,
     to_rows,
@@ -123,7 +125,7 @@ def run_frames(
     nodes = (bodies * grid.shape[0], *grid.shape[1:])
     # neighbours beside each other: in the cache, and on the same device
     orders = [tile_order(state.cells, nodes) for state in states]
-    states = tuple(_reorder(state, order) for state, order in zip(states, orders))
+    states = tuple(reorder(state, order) for state, order in zip(states, orders))
     points = grid.points
     still = grouping.still
     laws = tuple(group.law for group in grouping.groups)
@@ -175,8 +177,8 @@ def run_frames(
         )
     states, paths, (health, sides_met) = run(context, states, inputs.start)
     back = [inverse(order) for order in orders]
-    states = tuple(_reorder(state, order) for state, order in zip(states, back))
-    paths = tuple(_reorder(path, order, 1) for path, order in zip(paths, back))
+    states = tuple(reorder(state, order) for state, order in zip(states, back))
+    paths = tuple(reorder(path, order, 1) for path, order in zip(paths, back))
     return grouping.particles(states, grid), grouping.path(paths, grid, frames), health, sides_met
 
 
@@ -192,6 +194,7 @@ def _frames(
 ) -> tuple[tuple[State, ...], tuple[State, ...], tuple[Health, Bool[Array, "3 2"] | None]]:
     """Frames of substeps on this device's share of the particles: states after them, their paths, the health."""
     counts = [len(state.cells) for state in states]
+    size = None if statics.warp else chunk_size(counts, config.chunk)
     simple = not statics.custom_vjp or statics.solve_balance is not None
     steps_of_frame = _plain_steps if simple else _checkpointed_steps
     whole_frame = None
@@ -200,15 +203,14 @@ def _frames(
 
     def frame(carry, _):
         states, worst, steps, stopped = carry
-        chunks = tuple(to_chunks(state, len(state.cells) if statics.warp else config.chunk) for state in states)
+        chunks = tuple(to_chunks(state, size) for state in states)
         if whole_frame is None:
             chunks, health = steps_of_frame(statics, substeps, of, context, start, chunks, steps)
         else:
             chunks, health = whole_frame(chunks)
         steps = steps + substeps
-        moved = tuple(
-            bound_visual(to_rows(chunk, count), config.visual_stretch) for chunk, count in zip(chunks, counts)
-        )
+        moved = tuple(to_rows(chunk, count) for chunk, count in zip(chunks, counts))
+        moved = bound_visual(moved, config.visual_stretch)
         health = _counted(statics, health, moved)
         bad = health.is_bad()
         if config.stop:
@@ -362,7 +364,3 @@ def _specific_volume(particles: Particles, bodies: int) -> Float[Array, "b"]:
         jax.ops.segment_sum(values, particles.body, bodies) for values in (particles.volume0, particles.mass)
     )
     return volume / jnp.where(mass > 0, mass, 1.0)
-
-
-def _reorder(state: Any, order: Int[Array, "p"], axis: int = 0) -> Any:
-    return jax.tree.map(lambda rows: jnp.take(rows, order, axis), state)

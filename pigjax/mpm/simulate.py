@@ -129,7 +129,7 @@ def simulate_compiled(
         frames: number of frames.
     """
     devices = devices_for(config, len(particles))
-    if config.box is None or (shape := _smaller(config.box, domain.shape)) == domain.shape:
+    if not isinstance(config.box, tuple) or (shape := _smaller(config.box, domain.shape)) == domain.shape:
         return run_frames(particles, whole(domain), table, config, devices, inputs, frames=frames)[:3]
     duration = inputs.duration
 

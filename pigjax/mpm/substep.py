@@ -149,13 +149,12 @@ def particles_to_grid(statics: StepStatics, context: StepContext, states: tuple[
         loop = ChunkLoop(partial(_scatter_chunk, statics), statics.kernel, context.nodes)
         shared = (context.dt, context.grid.dx)
         total = jnp.zeros((*context.nodes, CHANNELS), context.dt.dtype)
-        for state in states:
-            chunks = (state.v, state.C, state.stress, state.mass, state.volume)
+        for cells, *chunks in _common_chunks(states):
             if statics.warp:
-                total = _scatter_all(statics, context, state.cells, chunks, total)
+                total = _scatter_all(statics, context, cells, tuple(chunks), total)
                 continue
             total = total + scatter_chunks(
-                loop, context.opaque_true, state.cells, chunks, shared, custom_vjp=statics.custom_vjp
+                loop, context.opaque_true, cells, tuple(chunks), shared, custom_vjp=statics.custom_vjp
             )
         return total if statics.axis is None else lax.psum(total, statics.axis)
 
@@ -211,6 +210,20 @@ def grid_to_particles(
         own = lax.stop_gradient(lanes.of_step(context.dt / context.grid.dx))
         health = health.combine(own, counts=jnp.add)
     return tuple(moved), replace(health, unconverged=1 - jnp.asarray(converged).astype(int))
+
+
+def _common_chunks(states: tuple[State, ...]) -> list[tuple[Array, ...]]:
+    """What P2G reads of the particles: those of all laws together, where each is one chunk or all chunks have one size.
+
+    P2G knows no laws, so that one loop serves them all, and five laws take no longer to compile than one.
+    """
+    read: list[tuple[Array, ...]] = [
+        (state.cells, state.v, state.C, state.stress, state.mass, state.volume) for state in states
+    ]
+    single = all(len(state.cells) == 1 for state in states)
+    if len(read) < 2 or not (single or len({state.cells.shape[2] for state in states}) == 1):
+        return read
+    return [tuple(jnp.concatenate(rows, 2 if single else 0) for rows in zip(*read))]
 
 
 def _scatter_chunk(

@@ -323,12 +323,6 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
 _SHAPES = {"a box": ("lower", "upper"), "a ball": ("centre", "radius"), "a cylinder": ("bottom", "top", "radius")}
 _FILLED = {"a vessel": ("fills",), **_SHAPES}
 
-# fields of an object that a volume has not
-_OF_CAPTURED = (
-    "id", "gaussians", "within", "height", "offset", "rotation", "scale", "copies", "removed", "fixed", "fill",
-    "hollow", "refit",
-)  # fmt: skip
-
 
 class VolumeSpec(ObjectSpec, frozen=True, kw_only=True):
     """Matter that nobody captured: it fills a vessel of the scene, a box, a ball or a cylinder.
@@ -352,11 +346,15 @@ class VolumeSpec(ObjectSpec, frozen=True, kw_only=True):
     splats: Literal["carried", "own", "auto"] = "own"  # it has no others
     surface: Literal["particles", "smooth"] = "smooth"  # of a fluid
     section: ClassVar[str] = "volumes"
+    of_captured: ClassVar[tuple[str, ...]] = (
+        "id", "gaussians", "within", "height", "offset", "rotation", "scale", "copies", "removed", "fixed", "fill",
+        "hollow", "refit",
+    )  # fields of an object that a volume has not  # fmt: skip
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:
         """One shape is given, and nothing that only captured objects have."""
         yield from super().rules()
-        for name in _OF_CAPTURED:
+        for name in self.of_captured:
             still = getattr(self, name) == getattr(ObjectSpec(), name)
             yield name, still, "it belongs to captured objects; a volume lies where its shape says; remove it"
         yield "splats", self.splats == "own", "a volume has no other splats than its own; remove the field"
