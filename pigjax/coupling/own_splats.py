@@ -16,7 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from pigjax.core.arguments import checked
@@ -38,7 +39,11 @@ _FAINT = 0.02  # least opacity of a piece
 _SIDE = 160  # of the pictures [px]
 _ELEVATIONS = (0.1, 0.5, 1.05)  # of the cameras [rad]
 _AROUND = 10  # cameras at each elevation; every fifth of all is held out
-_RATES = {"means": 8e-3, "log_scales": 1e-2, "quats": 5e-3, "logit_opacities": 4e-2, "sh": 1e-2}  # means: in cells
+_NOTHING = -30.0  # logit of an opacity that draws nothing
+_LAST = 0.1  # step sizes at the end, of those at the start
+_ADAM = optax.scale_by_adam(eps=1e-15)
+# sizes of the first steps; of means in cells
+_RATES = {"means": 2.5e-2, "log_scales": 4.5e-2, "quats": 1.5e-2, "logit_opacities": 8e-2, "sh": 2e-2}
 
 
 class OwnSplats(NamedTuple):
@@ -60,7 +65,7 @@ def make_own_splats(
     cameras: Camera | None = None,
     up: Any = (0.0, 0.0, 1.0),
     inside: Any = None,
-    steps: int = 240,
+    steps: int = 100,
 ) -> OwnSplats:
     """Splats of its own for one object: small, each carried by one particle, and at rest the same picture. Host.
 
@@ -79,7 +84,7 @@ def make_own_splats(
         cameras: batch of views for the fit, every fifth held out; None: thirty around the object.
         up: axis that points up, for the default cameras.
         inside: colour of inside splats in [0, 1]; None: that of the nearest surface.
-        steps: of the fit; 0 leaves the pieces as they are cut. 240 take about 20 s on two cores.
+        steps: of the fit; 0 leaves the pieces as they are cut. Objects with about as many splats share its program.
 
     Returns:
         The splats, their carriers, and how well they match.
@@ -103,9 +108,10 @@ def make_own_splats(
     tree = cKDTree(points)
     gap, carrier = tree.query(np.asarray(pieces.means))
     near = gap < _NEAR * dx
-    pieces, carrier = jax.tree.map(lambda values: values[near], pieces), carrier[near]
+    # on the host: arrays of so many sizes would each compile what cuts and joins them
+    pieces, carrier = jax.tree.map(lambda values: np.asarray(values)[near], pieces), carrier[near]
     inner, of_inner = _inside(pieces, gaussians, points, np.bincount(carrier, minlength=len(points)), dx, inside)
-    own = jax.tree.map(lambda *parts: jnp.concatenate(parts), pieces, inner)
+    own = jax.tree.map(lambda *parts: jnp.asarray(np.concatenate(parts)), pieces, inner)
     carrier = np.concatenate([carrier, of_inner])
     own = _within(own, dx)
     if not steps or not len(own):
@@ -172,7 +178,7 @@ def _inside(
         means=jnp.asarray(points[rows], kind),
         log_scales=jnp.asarray(np.repeat(np.log(size)[:, None], 3, 1), kind),
         quats=jnp.asarray(np.tile([1.0, 0, 0, 0], (count, 1)), kind),
-        logit_opacities=jnp.full(count, _INNER_LOGIT, kind),
+        logit_opacities=jnp.asarray(np.full(count, _INNER_LOGIT), kind),
         sh=jnp.asarray(sh, kind),
     ), rows
 
@@ -188,64 +194,99 @@ def _cameras_around(gaussians: Gaussians, up: Any) -> Camera:
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), *rings)
 
 
-def _within(own: Gaussians, dx: float) -> Gaussians:
+def _within(own: Gaussians, dx: Float[Array, ""] | float) -> Gaussians:
     """The same with every standard deviation in its bounds."""
-    return replace(own, log_scales=jnp.clip(own.log_scales, np.log(_THINNEST * dx), np.log(WIDEST * dx)))
+    return replace(own, log_scales=jnp.clip(own.log_scales, jnp.log(_THINNEST * dx), jnp.log(WIDEST * dx)))
 
 
 def _refitted(
     own: Gaussians, truth: Gaussians, cameras: Camera, dx: float, steps: int
 ) -> tuple[Gaussians, float, float]:
     """Splats fitted to pictures of the truth, and the PSNR in held-out views before and after [dB]."""
-    count = cameras.world_to_cam.shape[0]
+    count, kind, cameras = len(cameras), own.means.dtype, jax.tree.map(np.asarray, cameras)
     held = [k for k in range(count) if k % 5 == 2] or [0]
     train = [k for k in range(count) if k not in held] or [0]
-    first = own.means
-    order = np.random.default_rng(0)
-    decay = partial(optax.exponential_decay, transition_steps=steps, decay_rate=0.1)
-    rates = {name: decay(rate * dx if name == "means" else rate) for name, rate in _RATES.items()}
-    optimizer = optax.partition(
-        {name: optax.adam(rate, eps=1e-15) for name, rate in rates.items()},
-        lambda tree: jax.tree_util.tree_map_with_path(lambda path, _: path[0].name, tree),
-    )
+    # the number of rows is a power of two, so that objects of about the same size share the program
+    rows = 1 << (max(len(own), len(truth)) - 1).bit_length()
+    start = _Fit.of(_padded(own, rows), dx)
+    nothing = jnp.zeros((cameras.height, cameras.width, 4), kind)
 
-    @jax.jit
-    def picture(gaussians: Gaussians, camera: Camera) -> Float[Array, "h w 4"]:
-        return _rgba(gaussians, camera)
+    def picture(fit: _Fit, view: int) -> Float[Array, "h w 4"]:
+        return _step(fit, cameras[view], nothing, jnp.zeros(2, kind), jnp.asarray(False))[1]
 
-    @jax.jit
-    def step(own: Gaussians, state: Any, camera: Camera, target: Float[Array, "h w 4"], grey: Float[Array, ""]):
-        def loss(own: Gaussians) -> Float[Array, ""]:
-            difference = _rgba(own, camera) - target
-            # before a grey of g, the error of a pixel is that of its colour less g times that of its alpha
-            seen = difference[..., :3] - grey * difference[..., 3:]
-            return jnp.abs(seen).mean() + 2.0 * (seen**2).mean()
+    shown = _Fit.of(_padded(truth, rows), dx)
+    targets = [picture(shown, view) for view in range(count)]
 
-        gradient = jax.grad(loss)(own)
-        change, state = optimizer.update(gradient, state, own)
-        change = replace(change, sh=change.sh.at[:, 1:].multiply(0.1))
-        own = _within(optax.apply_updates(own, change), dx)
-        shift = own.means - first
+    def score(fit: _Fit) -> float:
+        return float(np.mean([float(psnr(picture(fit, view), targets[view])) for view in held]))
+
+    random, fit, order = np.random.default_rng(0), start, np.zeros(0, int)
+    for number in range(steps):
+        if not len(order):
+            order = random.permutation(train)
+        view, order = order[0], order[1:]
+        # backgrounds are random greys, so that what is seen through counts
+        given = jnp.asarray([random.uniform(), _LAST ** (number / steps)], kind)
+        fit, _ = _step(fit, cameras[view], targets[view], given, jnp.asarray(True))
+    fitted = jax.tree.map(lambda values: jnp.asarray(np.asarray(values)[: len(own)]), fit.own)
+    return fitted, score(start), score(fit)
+
+
+def _padded(gaussians: Gaussians, rows: int) -> Gaussians:
+    """As many rows; those that are added draw nothing and have no gradient."""
+    added = rows - len(gaussians)
+    padded = jax.tree.map(lambda values: np.pad(values, [(0, added)] + [(0, 0)] * (values.ndim - 1), "edge"), gaussians)
+    padded.logit_opacities[len(gaussians) :] = _NOTHING
+    return jax.tree.map(jnp.asarray, padded)
+
+
+class _Fit(NamedTuple):
+    """Splats while they are fitted."""
+
+    own: Gaussians
+    adam: Any  # state of the optimiser
+    first: Float[Array, "n 3"]  # means at rest [m]
+    dx: Float[Array, ""]  # [m]
+
+    @classmethod
+    def of(cls, own: Gaussians, dx: float) -> _Fit:
+        """Before the first step."""
+        return cls(own, _ADAM.init(own), own.means, jnp.asarray(dx, own.means.dtype))
+
+
+@jax.jit
+def _step(
+    fit: _Fit, camera: Camera, target: Float[Array, "h w 4"], given: Float[Array, "2"], moves: Bool[Array, ""]
+) -> tuple[_Fit, Float[Array, "h w 4"]]:
+    """A step of Adam where it `moves`, and the picture before it; `given` are the grey behind and the step's size.
+
+    One program for pictures and steps: to compile it takes longer than most fits would gain from a second one.
+    """
+    grey, size = given
+
+    def draw(own: Gaussians) -> Float[Array, "h w 4"]:
+        frame = render(own, camera, background=0.0, outputs=("rgb", "alpha"))
+        assert frame.rgb is not None
+        assert frame.alpha is not None
+        return jnp.concatenate([frame.rgb, frame.alpha[..., None]], -1)
+
+    picture, transpose = jax.vjp(draw, fit.own)
+
+    def loss(picture: Float[Array, "h w 4"]) -> Float[Array, ""]:
+        difference = picture - target
+        # before a grey of g, the error of a pixel is that of its colour less g times that of its alpha
+        seen = difference[..., :3] - grey * difference[..., 3:]
+        return jnp.abs(seen).mean() + 2.0 * (seen**2).mean()
+
+    def move() -> tuple[Gaussians, Any]:
+        change, adam = _ADAM.update(transpose(jax.grad(loss)(picture))[0], fit.adam)
+        change = replace(change, means=change.means * fit.dx, sh=change.sh.at[:, 1:].multiply(0.1))
+        own = {name: getattr(fit.own, name) - size * rate * getattr(change, name) for name, rate in _RATES.items()}
+        shift = own["means"] - fit.first
         far = jnp.linalg.norm(shift, axis=1, keepdims=True)
         # a splat stays with its particle
-        return replace(own, means=first + shift * jnp.minimum(1, 0.5 * dx / jnp.maximum(far, 1e-30))), state
+        own["means"] = fit.first + shift * jnp.minimum(1, 0.5 * fit.dx / jnp.maximum(far, 1e-30))
+        return _within(Gaussians(**own), fit.dx), adam
 
-    targets = [picture(truth, cameras[k]) for k in range(count)]
-
-    def score(own: Gaussians) -> float:
-        return float(np.mean([float(psnr(picture(own, cameras[k]), targets[k])) for k in held]))
-
-    before, state = score(own), optimizer.init(own)
-    for number in range(steps):
-        if number % len(train) == 0:
-            order.shuffle(train)
-        view = train[number % len(train)]
-        own, state = step(own, state, cameras[view], targets[view], jnp.asarray(order.uniform(), own.means.dtype))
-    return own, before, score(own)
-
-
-def _rgba(gaussians: Gaussians, camera: Camera) -> Float[Array, "h w 4"]:
-    frame = render(gaussians, camera, background=0.0, outputs=("rgb", "alpha"))
-    assert frame.rgb is not None
-    assert frame.alpha is not None
-    return jnp.concatenate([frame.rgb, frame.alpha[..., None]], -1)
+    own, adam = lax.cond(moves, move, lambda: (fit.own, fit.adam))
+    return fit._replace(own=own, adam=adam), picture

@@ -228,6 +228,8 @@ def _feed(hasher: Any, value: Any, seen: dict[int, Any]) -> None:
         feed((value.func, value.args, value.keywords))
     elif isinstance(value, types.MethodType):
         feed((value.__func__, value.__self__))
+    elif isinstance(value, types.FunctionType) and hasattr(value, "__wrapped__") and _is_ours(value.__module__):
+        feed(inspect.unwrap(value))  # the wrapper that checks arguments changes with its first call
     elif isinstance(value, types.FunctionType):
         _feed_function(value, put, feed)
     elif callable(value) and hasattr(value, "__wrapped__"):
@@ -280,6 +282,10 @@ def _names_of(code: types.CodeType) -> set[str]:
 
 def _of_library(file: str | None) -> bool:
     return file is None or file.startswith("<frozen") or any(place in file for place in _OF_LIBRARIES)
+
+
+def _is_ours(module: str | None) -> bool:
+    return (module or "").partition(".")[0] == __name__.partition(".")[0]
 
 
 def _version(module: str | None) -> str:

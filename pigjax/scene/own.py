@@ -147,14 +147,18 @@ def with_own(
             continue
         members = np.flatnonzero(object_id == inputs.ids[name])
         mine = jax.tree.map(lambda values, members=members: values[members], inputs.gaussians)
-        mark = io.digest(mine, x[rows], plan.dx, entry.inside, make_own_splats)
+        settings: dict[str, Any] = {} if entry.refit else {"steps": 0}
+        mark = io.digest(mine, x[rows], plan.dx, entry.inside, settings, make_own_splats)
         made = _stored(stored or {}, f"{MADE}_{number}", mark)
         if made is None:
             axis = axis_of(scene.input.up)
-            made = make_own_splats(mine, x[rows], dx=plan.dx, up=axis, inside=entry.inside)
+            made = make_own_splats(mine, x[rows], dx=plan.dx, up=axis, inside=entry.inside, **settings)
+            fit = (
+                f"at rest {made.psnr:.1f} dB to them in views not fitted ({made.start:.1f} before the fit)"
+                if entry.refit else "as they are cut"
+            )  # fmt: skip
             say(
-                f"{name}: {len(mine)} Gaussians give way to {len(made.gaussians)} splats of its own; at rest"
-                f" {made.psnr:.1f} dB to them in views not fitted ({made.start:.1f} before the fit);"
+                f"{name}: {len(mine)} Gaussians give way to {len(made.gaussians)} splats of its own; {fit};"
                 f" {made.seconds:.0f} s."
             )
         arrays |= _arrays(made, f"{MADE}_{number}", mark)

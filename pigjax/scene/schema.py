@@ -29,7 +29,7 @@ from pigjax.scene.world import WorldSpec, axis_of, metres_of
 from pigjax.splatting.types import RenderConfig
 
 Triple = tuple[float, float, float]
-_OF_OWN_SPLATS = {"inside": None, "surface": "particles", "transparency": 0.0, "sheen": 0.0}
+_OF_OWN_SPLATS = {"refit": True, "inside": None, "surface": "particles", "transparency": 0.0, "sheen": 0.0}
 OF_DRAWING = ("splats", *_OF_OWN_SPLATS, "colour", "grain")  # fields of an object on which no simulated state depends
 _NUMBERS = tuple(number.name for number in fields(Parameters))
 _PLACE = Limits(-1e9, 1e9, unit="m")
@@ -219,6 +219,8 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     # its splats in motion: those of the capture ("carried"), or ones as fine as its particles, made once ("own");
     # "auto": own ones for sand, snow, fluids, foam and plasticine, and for other matter that the simulation tore
     splats: Literal["carried", "own", "auto"] = "carried"
+    # own splats: fitted to pictures of the object at rest; false leaves them as they are cut, which takes no time
+    refit: bool = True
     inside: Annotated[Triple, Limits(0, 1)] | None = None  # colour within, of own splats; None: of the nearest surface
     # of a fluid with own splats: "smooth" shapes them by their neighbours, so that a pool is flat and a drop round
     surface: Literal["particles", "smooth"] = "particles"
@@ -346,7 +348,7 @@ class VolumeSpec(ObjectSpec, frozen=True, kw_only=True):
     section: ClassVar[str] = "volumes"
     of_captured: ClassVar[tuple[str, ...]] = (
         "id", "gaussians", "within", "height", "offset", "rotation", "scale", "copies", "removed", "fixed", "fill",
-        "hollow",
+        "hollow", "refit",
     )  # fields of an object that a volume has not  # fmt: skip
 
     def rules(self) -> Iterable[tuple[str, bool, str]]:

@@ -10,7 +10,7 @@ import pytest
 from pigjax import ClampParams, Gaussians, InputError, deform, look_at, make_own_splats, psnr, render
 from pigjax.core.linalg import safe_norm
 from pigjax.coupling.binding import bind
-from pigjax.coupling.own_splats import WIDEST, split
+from pigjax.coupling.own_splats import WIDEST, _padded, _step, split
 from pigjax.mpm import make_particles
 from pigjax.mpm.materials import material_table, preset
 from pigjax.splatting.types import as_splats
@@ -83,7 +83,7 @@ def test_small_gaussians_are_not_cut():
 
 @pytest.mark.slow
 def test_fit_brings_the_picture_at_rest_back():
-    """On a coarse grid, which leaves 1157 splats, in 40 steps: 3.2 dB more in views that were not fitted."""
+    """On a coarse grid, which leaves 1157 splats, in 40 steps; a second object of about its size compiles nothing."""
     gaussians, x = ball(60)
     gaussians = dataclasses.replace(
         gaussians, log_scales=jnp.log(jnp.broadcast_to(jnp.asarray([0.11, 0.09, 0.01]), (60, 3)))
@@ -93,6 +93,21 @@ def test_fit_brings_the_picture_at_rest_back():
     cameras = jax.tree.map(lambda *v: jnp.stack(v), *near)
     made = make_own_splats(gaussians, x, dx=2 * DX, cameras=cameras, steps=40)
     assert made.psnr > made.start + 2
+    programs = _step._cache_size()
+    fewer = jax.tree.map(lambda values: values[:-4], gaussians)
+    again = make_own_splats(fewer, x, dx=2 * DX, cameras=cameras, steps=1)
+    assert len(again.gaussians) != len(made.gaussians)
+    assert _step._cache_size() == programs
+
+
+def test_rows_that_fill_up_draw_nothing():
+    gaussians, _ = ball(20)
+    more = _padded(gaussians, 32)
+    assert len(more) == 32
+    camera = look_at((0.8, 0.2, 0.6), (0.0, 0.0, 0.0), focal=30.0, width=16, height=16)
+    pictures = [render(each, camera, outputs=("rgb", "alpha")) for each in (gaussians, more)]
+    np.testing.assert_array_equal(pictures[0].alpha, pictures[1].alpha)
+    np.testing.assert_array_equal(pictures[0].rgb, pictures[1].rgb)
 
 
 def test_at_rest_own_splats_are_where_they_were_made(own):

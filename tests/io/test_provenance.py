@@ -289,3 +289,9 @@ def test_a_damaged_reconstruction_begins_anew(tmp_path):
     with pytest.warns(UserWarning, match="computed again"):
         again = pj.reconstruct(photos(), config, checkpoint=checkpoint)
     np.testing.assert_array_equal(first.gaussians.means, again.gaussians.means)
+
+
+def test_a_call_does_not_change_the_digest_of_a_function_that_checks_its_arguments():
+    before = io.digest(pj.look_at)
+    pj.look_at((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), focal=10.0, width=4, height=4)
+    assert io.digest(pj.look_at) == before
