@@ -251,7 +251,7 @@ def _checkpointed_steps(
         velocity, converged = update_grid(statics, context, states, nodes, start + number * context.dt)
         return grid_to_particles(statics, context, states, velocity, converged)
 
-    fixed = [{name for name in _FIXED if getattr(state, name) is not None} for state in states]
+    fixed = [[name for name in _FIXED if getattr(state, name) is not None] for state in states]
     passive = tuple(
         jax.tree.map(lambda _: False, state)._replace(**dict.fromkeys(names, True))
         for state, names in zip(states, fixed)
