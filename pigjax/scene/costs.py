@@ -53,6 +53,7 @@ class Required:
     photos: int = 0
     photo_pixels: int = 0  # of all photos
     voted: bool = False  # whether masks of photos vote
+    filled: int = 0  # Gaussians of objects whose hidden surface is closed
     contact: bool = False  # between bodies
     forces: int = 0
     integrator: str = "explicit"
@@ -194,6 +195,7 @@ def run_parts(needs: Required) -> list[Part]:
     if needs.voted:
         parts.append(Part("segment", "pixels that vote", needs.photo_pixels))
         parts.append(Part("segment", "Gaussians in photos", needs.gaussians * needs.photos))
+    parts.append(Part("segment", "Gaussians of filled objects", needs.filled))
     parts += _steps(needs, steps)
     parts += [
         Part("simulate", "frames", needs.frames),
@@ -239,6 +241,7 @@ def compile_parts(needs: Required) -> list[Part]:
     parts = [
         Part("read", "start", 1),
         Part("segment", "votes", int(needs.voted)),
+        Part("segment", "filling", int(needs.filled > 0)),
         Part("seed", "start", 1),
         Part("seed", "still objects", needs.still_objects),
         Part("simulate", "start", 1),

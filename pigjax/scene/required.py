@@ -312,6 +312,7 @@ def _required(
         photos=photos,
         photo_pixels=pixels,
         voted=voted,
+        filled=int(np.isin(object_id, [inputs.ids[name] for name, entry in scene.objects.items() if entry.fill]).sum()),
         contact=spec.contact_friction is not None and len(bodies) > 1,
         forces=len(scene.forces),
         integrator=integrator,
