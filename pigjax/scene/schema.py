@@ -295,7 +295,8 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
         """
         where = joined(self.section, name)
         if (self.material is None) == (self.model is None):
-            raise SceneError(f"{where}: give either material (a preset) or model (a law with its numbers).")
+            both = "" if self.model is None else f".model: {where}.material is given, too"
+            raise SceneError(f"{where}{both}: give either material (a preset) or model (a law with its numbers).")
         for key, value, known in (("material", self.material, PRESETS), ("model", self.model, LAWS)):
             if value is not None and value not in known:
                 raise SceneError(f"{where}.{key} = {value!r}: {suggest(value, known)}.")

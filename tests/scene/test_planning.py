@@ -241,7 +241,7 @@ def test_a_plan_keeps_its_budget_and_changes_only_the_knobs(scene):
         "simulation.dx", "simulation.cfl", "drawing.scale", "drawing.alpha_min"
     }  # fmt: skip
     assert fine.chosen in fine.front
-    long = budgets.changed(scene, {"simulation": {"frames": 5000}})
+    long = budgets.changed(scene, {"simulation": {"frames": 5000, "dx": scene.simulation.dx / 4}})
     seconds = predict(required_by(survey(long))).seconds
     quick = plan_scene(long, time=0.9 * seconds, probe=False)
     assert quick.prediction.seconds <= 0.9 * seconds

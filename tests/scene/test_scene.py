@@ -49,7 +49,10 @@ BAD = {
     ),
     "bad poisson": (values(objects__ball={"material": "jelly", "poisson": 0.5}), r"objects\.ball\.poisson = 0\.5"),
     "no material": (values(objects__ball={}), r"objects\.ball: give either material"),
-    "two materials": (values(objects__ball={"material": "jelly", "model": "fluid"}), r"objects\.ball: give either"),
+    "two materials": (
+        values(objects__ball={"material": "jelly", "model": "fluid"}),
+        r"objects\.ball\.model: .* is given, too",
+    ),
     "unknown law": (values(objects__ball={"model": "jello", "density": 1.0}), r"objects\.ball\..*jello"),
     "no density": (values(objects__ball={"model": "neo_hookean"}), r"objects\.ball\.density is missing"),
     "nothing moves": (values(objects={"table": {"id": 1, "fixed": True}}), r"objects: none moves"),
