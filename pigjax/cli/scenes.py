@@ -53,7 +53,7 @@ def demo(
 ) -> None:
     """Simulate the bundled tabletop scene and leave a video: a draft with pictures of full size, for a quick start.
 
-    `--accuracy standard` takes three times the matter and has half the error.
+    `--accuracy standard` takes finer matter: slower, with a smaller error.
     """
     if accuracy is None:
         accuracy, changes = "draft", ["drawing.scale=1.0", *(changes or [])]

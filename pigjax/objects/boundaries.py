@@ -84,8 +84,8 @@ def refit_boundaries(
         steps: of the refit, each with the whole scene in one view and up to eight objects in one that has a mask; by
             default two epochs of 32 views
             (`python -m benchmarks segmentation refit`). 0 cuts and lifts only.
-        rounds: of cutting; 2 locate an edge to a quarter of a Gaussian. 0, the default, cuts nothing: on the tabletop
-            the refit alone scores as high. Worth a try where Gaussians are larger than the details of the masks.
+        rounds: of cutting; 2 locate an edge to a quarter of a Gaussian. 0, the default, cuts nothing: the refit alone
+            shrinks what straddles. Worth a try where Gaussians are larger than the details of the masks.
         straddling: Gaussians of which the commonest id has a smaller share than this are cut.
         valid: pixels that count (`Views.valid`); None: all.
         fill: give Gaussians that no view saw the id of their neighbours, as `pigjax segment` does.

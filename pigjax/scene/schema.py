@@ -219,7 +219,8 @@ class ObjectSpec(Section, frozen=True, kw_only=True):
     # its splats in motion: those of the capture ("carried"), or ones as fine as its particles, made once ("own");
     # "auto": own ones for sand, snow, fluids, foam and plasticine, and for other matter that the simulation tore
     splats: Literal["carried", "own", "auto"] = "carried"
-    # own splats: fitted to pictures of the object at rest; false leaves them as they are cut, in a few seconds
+    # own splats: fitted to pictures of the object at rest; false leaves them as they are cut: quicker, and at rest less
+    # like the capture
     refit: bool = True
     inside: Annotated[Triple, Limits(0, 1)] | None = None  # colour within, of own splats; None: of the nearest surface
     # of a fluid with own splats: "smooth" shapes them by their neighbours, so that a pool is flat and a drop round

@@ -34,7 +34,7 @@ def test_the_program_does_not_depend_on_the_order_of_hashes():
             [sys.executable, "-c", CHILD], env=os.environ | {"PYTHONHASHSEED": seed}, capture_output=True, text=True,
             check=True,
         ).stdout.strip()
-        for seed in "123"
+        for seed in "45"  # by which sets of the names of particle fields have other orders
     }  # fmt: skip
     assert len(said) == 1
     assert len(said.pop()) == 2 * hashlib.sha256().digest_size
