@@ -72,7 +72,7 @@ def simulate(
         InputError: no number of substeps is stable.
         SimulationError: matter has spread so far that its grid would not fit into memory.
     """
-    config, active_grid = rule.config, active_grid or ActiveGrid()
+    config, active_grid, table = rule.config, active_grid or ActiveGrid(), table.required()
     devices, dtype = devices_for(config, len(particles)), particles.x.dtype
     gravity = jnp.asarray(gravity, dtype)
     path = None

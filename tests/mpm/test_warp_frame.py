@@ -245,7 +245,7 @@ def test_scenes_that_do_not_qualify_are_told_why_or_take_the_transfers():
         "the integrator is implicit": {"integrator": "implicit"},
         "a fixed order is asked for": {"deterministic": True},
         "2 devices share": {"devices": 2},
-        "the law fluid, not fixed_corotated or neo_hookean": {"law": "fluid"},
+        "the law fluid without viscosity, not fixed_corotated or neo_hookean": {"law": "fluid"},
         "bodies are in contact": {"contact": BodyContact(bodies=2)},
         r"colliders\[0\] moves": {"colliders": (moving,)},
         "there are forces": {"forces": (field,)},
