@@ -148,7 +148,7 @@ def split(gaussians: Gaussians, widest: float, around: tuple[np.ndarray, float] 
         step = _SPACING * widest
         low, high = -_SPAN * spread, _SPAN * spread
         if around is not None:
-            centre = axes[k].T @ (around[0] - host.means[k])  # in the Gaussian's axes
+            centre = np.dot(axes[k].T, around[0] - host.means[k])  # in the Gaussian's axes
             low, high = np.maximum(low, centre - around[1]), np.minimum(high, centre + around[1])
         lines = [
             np.arange(np.ceil(low[i] / step), np.floor(high[i] / step) + 1) * step if cut[i] else np.zeros(1)
