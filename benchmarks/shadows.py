@@ -1,4 +1,4 @@
-"""Shadows: what they cost beside a picture, by the samples of the light.
+"""Shadows: cost relative to a picture, by the samples of the light.
 
 The tabletop in its rest pose; what stands on the table casts. Drawing and shadows are timed in turn, in one process.
 """
