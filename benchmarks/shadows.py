@@ -46,6 +46,6 @@ def price(options) -> str:
     )
 
 
-PARTS = {"price": ("Price of shadows", price)}
+PARTS = {"price": ("Cost of shadows", price)}
 OPTIONS = {"samples": {"nargs": "+", "type": int, "default": [1, 8], "help": "of the light"}}
 DEVICES = None
