@@ -1,6 +1,9 @@
 """Real captures: reconstruction of a folder of posed photos, and objects from their masks."""
 
 import dataclasses
+import hashlib
+import json
+import subprocess
 import time
 from pathlib import Path
 
@@ -9,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.common.command import start_worker
-from benchmarks.common.pages import head, row
+from benchmarks.common.pages import ROOT, head, row
 from benchmarks.common.timing import peak_memory, use_host_devices
 from pigjax import (
     FitConfig,
@@ -28,7 +31,7 @@ from pigjax.reconstruction.train import for_capture
 
 COLUMNS = (
     "capture", "settings", "photos", "size [px]", "splats", "steps", "PSNR [dB]", "least", "gains fitted", "training",
-    "SSIM", "s", "CPU s", "GB", "mask IoU",
+    "SSIM", "s", "CPU s", "GB", "mask IoU", "code",
 )  # fmt: skip
 # settings of `FitConfig` beside its defaults; each is compared with none
 SWITCHES = {
@@ -51,7 +54,8 @@ _LEGEND = (
     "PSNR and SSIM are means over the held-out photos, every eighth; least: the worst of them; gains fitted: mean PSNR"
     " once red, green and blue of each held-out photo are scaled to it (gsplat's cc_psnr); training: PSNR of photos"
     " that were fitted, with their own gains and cameras. Mask IoU: every third masked view, whose mask did not vote,"
-    " against the objects that the other masks gave. Seconds include compilation."
+    " against the objects that the other masks gave. Seconds include compilation. Code: the commit of the run; a row"
+    " that lies in `--out` already, made from the same photos and options, is printed without a new run."
 )
 
 
@@ -74,20 +78,47 @@ def _print(options, changed: list[str]) -> None:
     print(head(*COLUMNS), flush=True)
     for name in names:
         for switch in changed:
-            out = "" if options.out is None else (options.out / f"{name}-{switch}.ply").resolve()
-            folder = (options.data / name).resolve()
-            given = (options.size, options.steps, options.splats or "", switch, out)
-            said, _ = start_worker("real", folder, *given).communicate()
-            lines = said.strip().splitlines()
-            done = bool(lines) and lines[-1].startswith("|")
-            print(lines[-1] if done else row(name, switch, "failed", *[""] * (len(COLUMNS) - 3)), flush=True)
+            print(_row(options, name, switch), flush=True)
     print(f"\n{_LEGEND}")
+
+
+def _row(options, name: str, switch: str) -> str:
+    """Line of the table: of an earlier run with the same photos and options, or of a process of its own."""
+    folder = (options.data / name).resolve()
+    out = "" if options.out is None else (options.out / f"{name}-{switch}.ply").resolve()
+    given = [options.size, options.steps, options.splats or "", switch]
+    asked, kept = [_fingerprint(folder), *map(str, given)], out and out.with_suffix(".json")
+    if kept and kept.is_file() and out.is_file():
+        earlier = json.loads(kept.read_text())
+        if earlier["asked"] == asked:
+            return earlier["row"]
+    said, _ = start_worker("real", folder, *given, out).communicate()
+    lines = said.strip().splitlines()
+    if not lines or not lines[-1].startswith("|"):
+        return row(name, switch, "failed", *[""] * (len(COLUMNS) - 3))
+    if kept:
+        kept.write_text(json.dumps({"asked": asked, "row": lines[-1]}))
+    return lines[-1]
+
+
+def _fingerprint(folder: Path) -> str:
+    """Hash of all files of a capture, by name and content."""
+    found = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        found.update(str(path.relative_to(folder)).encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    return found.hexdigest()
+
+
+def _commit() -> str:
+    """Short name of the commit, with + where files were changed since."""
+    said = subprocess.run(("git", "describe", "--always", "--dirty=+"), cwd=ROOT, capture_output=True, text=True)
+    return said.stdout.strip()
 
 
 def worker(folder: str, size: str, steps: str, splats: str, switch: str, out: str) -> None:
     """Reconstruct one capture, and print its line of the table."""
     use_host_devices(None)
-    path = Path(folder)
+    path, commit = Path(folder), _commit()
     masks = (path / "object_mask").is_dir() or None
     views = load_views(path, masks=masks, missing_masks="abstain", max_size=int(size))
     points = load_points(views.points_path) if views.points_path else None
@@ -103,7 +134,7 @@ def worker(folder: str, size: str, steps: str, splats: str, switch: str, out: st
         path.name, switch, len(views), f"{views.cameras.width}x{views.cameras.height}", len(result.gaussians), steps,
         f"{result.mean_psnr:.2f}", least, gained, f"{_training_psnr(result, views.training, config):.2f}",
         f"{result.mean_ssim:.4f}", f"{begun:.0f}", f"{worked:.0f}", f"{peak_memory():.1f}",
-        _mask_iou(result.gaussians, views, config.render),
+        _mask_iou(result.gaussians, views, config.render), commit,
     ]  # fmt: skip
     print(row(*cells))
 

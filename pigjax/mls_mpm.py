@@ -129,6 +129,7 @@ def step(
         check_dt(float(dt), particles, grid, table, config, colliders)
     elif config.integrator == "auto":
         raise InputError(f"step {_UNDECIDED}")
+    table = table.required()
     end, _, health = _compiled(particles, grid, table, config, dt, gravity, colliders, contact, pins, forces, 1, 1)
     return end, health
 
@@ -187,6 +188,7 @@ def rollout(
     _check_rigid(particles, table, config, contact)
     check_forces(forces, len(particles))
     check_steps(frames, frame_dt, gravity)
+    table = table.required()
     shared = (particles, grid, table, frame_dt, gravity, colliders, contact, pins, forces)
     if not is_known(shared) or is_compiling():
         if sleep is not None:

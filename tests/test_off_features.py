@@ -1,9 +1,11 @@
 """A scene traces what it has and nothing else: programs are compared as they are traced, before any compilation."""
 
+import functools
 import re
 from collections import Counter
 from dataclasses import fields
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,8 +51,8 @@ def material(law, **numbers):
     return Material(law, **{**ELASTIC, **own, **numbers})
 
 
-def traced(materials=None, *, colliders=(), contact=None, pins=(), forces=(), **config):
-    """One step of two particles of the first material."""
+def traced(materials=None, *, colliders=(), contact=None, pins=(), forces=(), known=False, **config):
+    """One step of two particles of the first material, whose numbers are traced or known."""
     table = material_table(materials or [material("neo_hookean")])
     particles = make_particles(jnp.full((2, 3), 0.6), volume=1e-4, table=table)
 
@@ -61,7 +63,11 @@ def traced(materials=None, *, colliders=(), contact=None, pins=(), forces=(), **
             contact=contact, pins=pins, forces=forces,
         )  # fmt: skip
 
-    return jax.make_jaxpr(run)(particles, table)
+    return (
+        jax.make_jaxpr(lambda particles: run(particles, table))(particles)
+        if known
+        else jax.make_jaxpr(run)(particles, table)
+    )
 
 
 def text(program):
@@ -172,6 +178,60 @@ def test_laws_of_the_table_without_particles_are_not_traced(plain):
     for law in ("fibres", "fluid", "drucker_prager", "von_mises", "foam"):
         assert not SIGNS[law][1](program), law
     assert in_steps(program) == in_steps(plain)
+
+
+DROPPED = {  # the number whose zero takes terms away, and the primitives of which a step then has fewer
+    "fluid": ("viscosity", {"mul", "add"}),
+    "von_mises": ("hardening_modulus", {"min"}),
+    "plasticine": ("hardening_modulus", {"div"}),
+    "snow": ("hardening_coefficient", {"exp", "min"}),
+}
+SOFTER = {"plasticine": -1.0}  # values other than zero; 1 where none is named
+
+
+@pytest.mark.parametrize("law", DROPPED)
+def test_a_zero_that_is_known_traces_nothing(law):
+    number, fewer = DROPPED[law]
+    without, given = (material(law, **{number: value}) for value in (0.0, SOFTER.get(law, 1.0)))
+    counts = {known: in_steps(traced([without], known=known)) for known in (True, False)}
+    assert in_steps(traced([given], known=True)) == counts[False]
+    less = counts[False] - counts[True]
+    assert counts[True].total() < counts[False].total()
+    assert fewer <= set(less), less
+    # a row of the same law with another value keeps the term in both, so that they stay one group
+    assert in_steps(traced([without, given], known=True)).total() >= counts[False].total()
+
+
+@pytest.mark.parametrize("law", DROPPED)
+def test_what_remains_of_a_law_gives_the_same_state_and_stress(law):
+    number = DROPPED[law][0]
+    m = material(law, **{number: 0.0})
+    rng = np.random.default_rng(0)
+    F, rate = (
+        jnp.asarray(a) for a in (np.eye(3)[..., None] + 0.2 * rng.normal(size=(3, 3, 40)), rng.normal(size=(3, 3, 40)))
+    )
+    hardening = 0.1 * rng.normal(size=40) if LAWS[law].hardens else None
+    (remaining,) = material_table([m]).required().laws
+    assert remaining != law
+    answers = [respond(name, F, rate, 1e-2, hardening, m) for name in (law, remaining)]
+    for full, short in zip(*answers):
+        if full is not None:
+            np.testing.assert_allclose(short, full, rtol=1e-5, atol=1e-5 * np.abs(full).max())
+
+
+def test_a_value_given_after_a_zero_is_not_ignored():
+    table = material_table([material("fluid", viscosity=0.0)])
+    thick = eqx.tree_at(lambda t: t.viscosity, table, jnp.asarray([50.0]))
+    assert table.required().laws != table.laws
+    assert thick.required().laws == thick.laws
+    rng = np.random.default_rng(1)
+    x = jnp.asarray(0.6 + 0.05 * rng.random((50, 3)), jnp.float32)
+    particles = make_particles(x, volume=1e-5, table=table, velocity=rng.normal(size=(50, 3)))
+    run = functools.partial(
+        rollout, particles, DOMAIN, config=SimConfig(substeps=4), frames=1, frame_dt=1e-3, gravity=(0, 0, 0)
+    )
+    thin, slow = (run(table=given)[0].v for given in (table, thick))
+    assert float(jnp.abs(thin - slow).max()) > 1e-4  # rounding is below 1e-6
 
 
 def test_matter_that_does_not_tear_pays_nothing_for_it(plain):

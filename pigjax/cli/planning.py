@@ -12,6 +12,7 @@ from pigjax.cli.base import (
     Changes,
     DropInvalid,
     NoCache,
+    Overwrite,
     Quiet,
     answers,
     app,
@@ -58,10 +59,12 @@ def plan(
     drop_invalid: DropInvalid = False,
     quiet: Quiet = False,
     no_cache: NoCache = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Predict time, memory and error of a scene, and find settings that keep a budget."""
     prepare_jax()
     from pigjax import io
+    from pigjax.core.errors import InputError
     from pigjax.scene import load_scene, plan_scene
     from pigjax.scene.budget import changed
     from pigjax.scene.decode import settings_from
@@ -72,6 +75,8 @@ def plan(
         asked = changed(asked, {"input": {"drop_invalid": True}})
     if out is not None:
         io.output_folder(out.parent, files=(out.name,))
+        if out.exists() and not overwrite:
+            raise InputError(f"{out}: exists; give --overwrite to replace it, or another -o.")
     console.print(said("reading the scene ..."))
     found = plan_scene(asked, time=time, error=error, memory=memory)
     tell(found, str(scene))

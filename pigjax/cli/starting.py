@@ -57,8 +57,9 @@ def new(
         Path(f"scene-{io.safe_name(stem)}") if out is None else out,
         files=("scene.toml", "labels.npz"), folders=("thumbnails",),
     )  # fmt: skip
-    if (folder / "scene.toml").exists() and not overwrite:
-        raise InputError(f"{folder / 'scene.toml'}: exists; give --overwrite to replace it, or another -o.")
+    for name in ("scene.toml", "labels.npz"):
+        if (folder / name).exists() and not overwrite:
+            raise InputError(f"{folder / name}: exists; give --overwrite to replace it, or another -o.")
     draft = write_draft(found, folder, up=up, ask=_ask if sys.stdin.isatty() and up is None else None)
     for remark in draft.remarks:
         console.print(said(remark, label="note: ", style="yellow"), soft_wrap=True)

@@ -166,6 +166,8 @@ def deform(
     rest = as_splats(gaussians)
     at_rest = jnp.broadcast_to(jnp.eye(3, dtype=F.dtype), (len(gaussians), 3, 3))
     if binding is not None and binding.own is not None:
+        if coloured and turned is None:  # of the mode "fixed"; splats of its own turn all the same
+            turned = jnp.broadcast_to(jnp.eye(3, dtype=F.dtype), (len(index), 3, 3))
         rows, means, shapes, turns = _own_pose(gaussians, particles, binding.own, params, turned)
         index, x, factors = (jnp.concatenate(parts) for parts in ((index, rows), (x, means), (factors, shapes)))
         turned = None if turned is None or turns is None else jnp.concatenate([turned, turns])

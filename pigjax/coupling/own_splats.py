@@ -104,7 +104,9 @@ def make_own_splats(
     ):
         raise InputError(f"make_own_splats: inside = {inside}: give three numbers in [0, 1], or None.")
     begun = time.perf_counter()
-    pieces = split(gaussians, WIDEST * dx)
+    centre = points.mean(0)
+    reach = float(np.linalg.norm(points - centre, axis=1).max()) + _NEAR * dx
+    pieces = split(gaussians, WIDEST * dx, around=(centre, reach))
     tree = cKDTree(points)
     gap, carrier = tree.query(np.asarray(pieces.means))
     near = gap < _NEAR * dx
@@ -121,10 +123,15 @@ def make_own_splats(
     return OwnSplats(own, carrier, after, before, time.perf_counter() - begun)
 
 
-def split(gaussians: Gaussians, widest: float) -> Gaussians:
+def split(gaussians: Gaussians, widest: float, around: tuple[np.ndarray, float] | None = None) -> Gaussians:
     """Gaussians with none wider than `widest` [m]; wide ones are cut into lattices of smaller ones. Host.
 
     A piece hides its share: -log(1 - alpha) of overlapping pieces adds up to that of the Gaussian at their place.
+
+    Args:
+        gaussians: to be cut.
+        widest: largest standard deviation of a piece [m].
+        around: centre and radius [m] of a ball; pieces beyond it are not made. None: all are.
     """
     host = jax.tree.map(np.asarray, gaussians)
     scales = np.exp(host.log_scales.astype(np.float64))
@@ -139,10 +146,16 @@ def split(gaussians: Gaussians, widest: float) -> Gaussians:
         child = np.where(cut, widest, scales[k])
         spread = np.sqrt(np.maximum(scales[k] ** 2 - np.where(cut, child**2, 0), 1e-30))  # of their centres
         step = _SPACING * widest
+        low, high = -_SPAN * spread, _SPAN * spread
+        if around is not None:
+            centre = axes[k].T @ (around[0] - host.means[k])  # in the Gaussian's axes
+            low, high = np.maximum(low, centre - around[1]), np.minimum(high, centre + around[1])
         lines = [
-            np.arange(-(n := int(np.floor(_SPAN * spread[i] / step))), n + 1) * step if cut[i] else np.zeros(1)
+            np.arange(np.ceil(low[i] / step), np.floor(high[i] / step) + 1) * step if cut[i] else np.zeros(1)
             for i in range(3)
         ]
+        if not all(map(len, lines)):
+            continue
         grid = np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 3)
         overlap = (np.sqrt(2 * np.pi) / _SPACING) ** cut.sum()  # pieces over a place, weighted by their alpha
         alpha = opacity[k] * np.exp(-0.5 * ((grid / spread) ** 2 * cut).sum(1))

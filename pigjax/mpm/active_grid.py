@@ -23,7 +23,7 @@ from pigjax.core.arguments import checked
 from pigjax.core.arrays import Vector, is_known
 from pigjax.core.errors import InputError, SimulationError
 from pigjax.mpm import WALL, Grid, Health, Particles, SimConfig, Trajectory
-from pigjax.mpm.materials import LAWS, MaterialTable
+from pigjax.mpm.materials import MaterialTable, law_of
 from pigjax.mpm.program import AXIS, GridWindow, StepInputs, run_frames
 
 LARGEST = 200_000_000  # nodes
@@ -215,7 +215,7 @@ def window_around(
 
 def _moving(particles: Particles, table: MaterialTable) -> Any:
     """Which particles [p] are of a law that moves."""
-    still = [row for row, law in enumerate(table.laws) if LAWS[law].respond is None]
+    still = [row for row, law in enumerate(table.laws) if law_of(law).respond is None]
     return sum(particles.material == row for row in still) == 0 if still else particles.material >= 0
 
 

@@ -19,7 +19,7 @@ from pigjax.core import linalg
 from pigjax.core.errors import InputError
 from pigjax.mpm.grid import Grid
 from pigjax.mpm.layout import State, inverse, order_of, reorder
-from pigjax.mpm.materials import LAWS, MaterialTable, Parameters, respond
+from pigjax.mpm.materials import MaterialTable, Parameters, law_of, respond
 from pigjax.mpm.particles import Particles, Trajectory
 
 
@@ -105,7 +105,7 @@ def group_by_law(
     counts = [sizes[law] for law in laws]
     parts = _split(particles if order is None else reorder(particles, order), counts)
     own = [None] * len(laws) if weights is None else _split(weights if order is None else weights[order], counts)
-    moves = [LAWS[law].respond is not None for law in laws]
+    moves = [law_of(law).respond is not None for law in laws]
     pairs = [
         _group(law, part, rows_of[law], table, grid, pieces, apart, weights)
         for law, part, moving, weights in zip(laws, parts, moves, own)
@@ -154,7 +154,7 @@ def _group(
     Particles outside of the grid begin half a cell beyond the place where its edge holds them: near enough for the
     weights of the kernel, and far enough to be counted.
     """
-    kind, several = LAWS[law], len(rows) > 1
+    kind, several = law_of(law), len(rows) > 1
     parameters = table.rows(np.array(rows) if several else rows[0])
     own_row = jnp.searchsorted(jnp.asarray(rows), part.material)
     last = np.array(grid.shape, part.x.dtype) - 1

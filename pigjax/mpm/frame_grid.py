@@ -150,9 +150,11 @@ def grid_kernels(single: bool) -> tuple[Any, Any]:
                     elif mode == wp.static(SEPARATE):
                         if speed < real(0.0):
                             glide = wp.length(tangential)
-                            if glide >= -friction * speed and glide > real(0.0):
-                                # no square of the glide, which may vanish
-                                ratio, way = friction * speed / glide, tangential / glide
+                            if glide >= -friction * speed:
+                                # no square of the glide, which may vanish; at none there is no friction either
+                                ratio, way = real(0.0), vec3()
+                                if glide > real(0.0):
+                                    ratio, way = friction * speed / glide, tangential / glide
                                 of_way = wp.dot(of_out, way)
                                 of_friction[b, c, n] += of_way * speed
                                 drag = of_way * friction

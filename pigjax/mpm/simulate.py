@@ -72,7 +72,7 @@ def simulate(
         InputError: no number of substeps is stable.
         SimulationError: matter has spread so far that its grid would not fit into memory.
     """
-    config, active_grid = rule.config, active_grid or ActiveGrid()
+    config, active_grid, table = rule.config, active_grid or ActiveGrid(), table.required()
     devices, dtype = devices_for(config, len(particles)), particles.x.dtype
     gravity = jnp.asarray(gravity, dtype)
     path = None
@@ -135,7 +135,10 @@ def simulate_compiled(
 
     def frame(carry, number):
         before, worst, stopped = carry
-        window, now = window_around(before, table, domain, shape, inputs), inputs._replace(start=duration * number)
+        window, now = (
+            window_around(before, table, domain, shape, inputs),
+            inputs._replace(start=inputs.start + duration * number),
+        )
         after, path, health, _ = run_frames(before, window, table, config, devices, now, frames=1, of=frames)
         bad = health.first_bad_frame >= 0
         if config.stop:  # the last good frame to the digit: another window would round positions again

@@ -98,13 +98,15 @@ def draft_scene(
         InputError: a file is damaged, the direction is none, or no part of the scene is large enough for an object.
     """
     given = None if up is None else axis_of(_direction(up))
-    gaussians = io.load_gaussians(gaussians_path, drop_invalid=True)
+    gaussians, dropped = io.read_gaussians(gaussians_path, drop_invalid=True)
     names = {} if names_path is None else io.load_names(names_path)
     views = None
     if views_path is not None:
         views = io.load_views(views_path, masks=masks_path, missing_masks="abstain")
     extent = extent_of(gaussians)
     remarks: list[str] = []
+    if dropped:
+        remarks.append(f"{dropped} Gaussians hold NaN or infinity and are left out (input.drop_invalid).")
     if given is None:
         cameras = None if views is None else views.cameras
         given, told = find_direction(cameras, np.asarray(gaussians.means, np.float64)[extent.core])
@@ -129,7 +131,7 @@ def draft_scene(
     world[:3, 3] = -middle
     for part in parts:
         part.low, part.high = part.low - middle, part.high - middle
-    sources = _Sources(gaussians_path, views_path, masks_path, names_path, folder)
+    sources = _Sources(gaussians_path, views_path, masks_path, names_path, folder, drops=dropped > 0)
     heights = np.asarray(here.means, np.float64)[_tallest(parts).members, 2] - middle[2]
     text = _text(sources, parts, labels is not None, given, origin, ground is not None, extent.radius, remarks, heights)
     return Draft(
@@ -344,6 +346,7 @@ class _Sources:
     masks: Path | None
     names: Path | None
     folder: Path
+    drops: bool = False  # whether invalid Gaussians are left out
 
     def lines(self, labelled: bool) -> list[str]:
         """The table `input`, without its axis."""
@@ -351,6 +354,7 @@ class _Sources:
         if labelled:
             entries |= {"masks": None, "names": None}
         lines = [f"{key} = {_quoted(self._relative(path))}" for key, path in entries.items() if path is not None]
+        lines += ["drop_invalid = true"] * self.drops
         return [*lines, *(['labels = "labels.npz" # which object each Gaussian belongs to'] if labelled else [])]
 
     def _relative(self, path: Path) -> str:

@@ -148,10 +148,10 @@ def with_own(
         members = np.flatnonzero(object_id == inputs.ids[name])
         mine = jax.tree.map(lambda values, members=members: values[members], inputs.gaussians)
         settings: dict[str, Any] = {} if entry.refit else {"steps": 0}
-        mark = io.digest(mine, x[rows], plan.dx, entry.inside, settings, make_own_splats)
+        axis = axis_of(scene.input.up)  # about which the fit's cameras stand
+        mark = io.digest(mine, x[rows], plan.dx, entry.inside, axis, settings, make_own_splats)
         made = _stored(stored or {}, f"{MADE}_{number}", mark)
         if made is None:
-            axis = axis_of(scene.input.up)
             made = make_own_splats(mine, x[rows], dx=plan.dx, up=axis, inside=entry.inside, **settings)
             fit = (
                 f"at rest {made.psnr:.1f} dB to them in views not fitted ({made.start:.1f} before the fit)"

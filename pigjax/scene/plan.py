@@ -34,6 +34,7 @@ from pigjax.mpm.forces import Force
 from pigjax.mpm.materials import Material, MaterialTable
 from pigjax.mpm.sleep import Sleep
 from pigjax.objects.lifting import lift
+from pigjax.scene.accuracy import LEVELS
 from pigjax.scene.advice import default_dx, remarks_on
 from pigjax.scene.forces import forces_of
 from pigjax.scene.framing import framing_camera
@@ -496,6 +497,9 @@ def provenance(scene: Scene, inputs: Inputs) -> dict[str, str]:
         settings.pop(name)
     if scene.output.compress_states:
         settings["output"] = {"compress_states": True}
+    coarsening = LEVELS[scene.accuracy].coarsening
+    if scene.simulation.dx is None and coarsening != 1:  # the level scales the default
+        settings["simulation"]["dx"] = f"default times {coarsening:g}"
     for name in INPUT_FILES:
         settings["input"].pop(name)
     for entry in (settings["objects"] | settings["volumes"]).values():

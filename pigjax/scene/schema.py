@@ -32,6 +32,10 @@ Triple = tuple[float, float, float]
 _OF_OWN_SPLATS = {"refit": True, "inside": None, "surface": "particles", "transparency": 0.0, "sheen": 0.0}
 OF_DRAWING = ("splats", *_OF_OWN_SPLATS, "colour", "grain")  # fields of an object on which no simulated state depends
 _NUMBERS = tuple(number.name for number in fields(Parameters))
+# fields of an object by what they belong to: they go when it becomes other matter, still, or moving
+OF_MATTER = ("material", "model", "rigid", "removed", *_NUMBERS)
+OF_MOTION = ("velocity", "angular_velocity", "start", "splats", *_OF_OWN_SPLATS)
+OF_STILL = ("fixed", "friction", "fill", "hollow")
 _PLACE = Limits(-1e9, 1e9, unit="m")
 _LENGTH = Limits(0, 1e9, above=True, unit="m")
 _SPEED = Limits(-1e6, 1e6, unit="m/s")
@@ -409,6 +413,9 @@ class Scene(Section, frozen=True):
                 owner = owners.setdefault(spec.id, name)
                 rule = f"{spec.id} is the id of objects.{joined(owner)}, too; each object has an id of its own"
                 yield joined("objects", name, "id"), owner == name, rule
+        shiny = any(spec.sheen for spec in (self.objects | self.volumes).values())
+        degree = self.drawing.sh_degree
+        yield "drawing.sh_degree", not shiny or degree is None or degree >= 2, "a sheen needs 2 or more; remove one"
         moving_names = [name for name, spec in self.objects.items() if spec.moves]
         moving_names += self.volumes
         for name, spec in self.volumes.items():
@@ -568,11 +575,13 @@ def scene_from(
 def values_of(scene: Scene, folder: str | os.PathLike[str]) -> dict[str, Any]:
     """Contents of a scene file in another folder that asks for the same: every field with its value.
 
-    The level of accuracy is "standard", since the fields hold the values that another level gave them.
+    The level of accuracy is "standard", since the fields hold the values that another level gave them; where dx is
+    left to the object's size, the scene keeps its level, which scales that default.
     """
     values: dict[str, Any] = _given(to_builtins(scene))
     values.pop("folder")
-    values["accuracy"] = "standard"
+    if scene.simulation.dx is not None:
+        values["accuracy"] = "standard"
     for name in INPUT_FILES:
         if name in values["input"]:
             values["input"][name] = os.path.relpath(scene.path(values["input"][name]), folder)

@@ -1,6 +1,7 @@
 """The logic of `pigjax view` without a browser: opening, picking, posing, colours, scene file, live simulation."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +13,9 @@ from pigjax.clamp import ClampParams, eigen_clamp
 from pigjax.cli.viewer.colouring import scale_end, strain_of, value_colours
 from pigjax.cli.viewer.draft import Draft
 from pigjax.cli.viewer.opened import open_path
+from pigjax.cli.viewer.page import Page
 from pigjax.cli.viewer.picking import pick_particle, pick_splat
-from pigjax.cli.viewer.server import refused
+from pigjax.cli.viewer.server import _is_local, refused
 from pigjax.cli.viewer.session import Session
 from pigjax.cli.viewer.solids import pose_of, shape_of
 from pigjax.core.errors import InputError, MissingFileError, SceneError
@@ -127,6 +129,9 @@ def test_splats_labels_scenes_and_folders_are_told_apart(folder, tmp_path):
     labelled = Session(open_path(tmp_path / "c.ply"))
     assert labelled.ids == [2, 3]
     assert labelled.name_of(3) == "object-3"
+    one = np.where(ids == 2, 2, 0)
+    io.save_labels(tmp_path / "labels.npz", one, votes, np.ones(len(ids)), np.array([0, 2, 3]), scene=mark)
+    assert open_path(tmp_path / "c.ply").values["input"]["labels"] == "labels.npz"  # the others are not the object's
     io.save_labels(tmp_path / "labels.npz", ids, votes, np.ones(len(ids)), np.array([0, 2, 3]), scene="other")
     strange = open_path(tmp_path / "c.ply")
     assert set(strange.object_id) == {1}
@@ -208,6 +213,12 @@ def test_roles_keep_what_fits_them(folder):
         draft.scene()
     draft.set_material("ball", "sand")
     assert draft.objects["ball"] == {"id": 1, "material": "sand"}
+    place = {"offset": [0.0, 0.0, 0.2], "copies": [[1.0, 0.0, 0.0]], "keep": "largest"}
+    draft.objects["ball"] |= {**place, "start": 0.1, "young": 1e4, "splats": "auto"}
+    draft.set_material("ball", "jelly")
+    assert draft.objects["ball"] == {"id": 1, "material": "jelly", **place, "start": 0.1, "splats": "auto"}
+    draft.make_fixed("ball")
+    assert draft.objects["ball"] == {"id": 1, "fixed": True, **place}
     draft.remove("ball")
     assert draft.objects == {}
 
@@ -361,6 +372,26 @@ def test_a_live_simulation_falls_is_dragged_changes_matter_and_goes_back(folder)
 )
 def test_pages_of_other_sites_are_refused(headers, wanted):
     assert refused(headers, local=True) is wanted
+
+
+@pytest.mark.parametrize(
+    ("host", "local"), [("127.0.0.1", True), ("127.1", True), ("::1", True), ("[::1]", True), ("0.0.0.0", False)]
+)
+def test_addresses_of_this_machine_alone_are_known(host, local):
+    assert _is_local(host) is local
+
+
+def test_a_new_drag_takes_hold_of_what_it_points_at():
+    """Though the end of the last one was skipped: of drags that wait, the page's thread does the last alone."""
+    live = SimpleNamespace(holds=False, particles=SimpleNamespace(x=np.eye(3)), held=[])
+    live.grab = lambda point, strength: (live.held.append(point), setattr(live, "holds", True))
+    live.drag_to = live.held.append
+    page = SimpleNamespace(
+        session=SimpleNamespace(live=live), playing=True, strength=SimpleNamespace(value=1), _grabbed=None
+    )
+    for particle in (0, 0, 2):
+        Page._drag(page, "move", particle, np.zeros(3))
+    assert [row.tolist() for row in live.held if row.any()] == [[1, 0, 0], [0, 0, 1]]
 
 
 def test_a_page_for_other_machines_answers_its_own_name_alone():

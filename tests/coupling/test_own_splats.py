@@ -75,6 +75,22 @@ def test_pieces_look_like_what_they_are_cut_from():
     assert float(psnr(pictures[1], pictures[0])) > 34
 
 
+def test_pieces_are_made_around_the_particles_alone():
+    """Of a Gaussian as wide as the object a lattice would fill the room around it."""
+    wide = Gaussians(
+        jnp.asarray([[0.5, 0.0, 0.0], [3.0, 0.0, 0.0]]), jnp.full((2, 3), np.log(0.4)),
+        jnp.asarray([[0.9, 0.1, 0.3, -0.2], [1.0, 0, 0, 0]]), jnp.full(2, 2.0), jnp.zeros((2, 1, 3)),
+    )  # fmt: skip
+    everywhere, near = split(wide, WIDEST * DX), split(wide, WIDEST * DX, around=(np.zeros(3), 0.3))
+
+    def inside(pieces):
+        means = np.asarray(pieces.means)
+        return means[np.linalg.norm(means, axis=1) < 0.3]
+
+    assert len(near) < 0.3 * len(everywhere)
+    np.testing.assert_array_equal(inside(near), inside(everywhere))
+
+
 def test_small_gaussians_are_not_cut():
     gaussians, _ = ball()
     same = split(gaussians, 1.0)
@@ -136,6 +152,18 @@ def test_rigid_motion_moves_splats_rigidly(own):
     splats = deform(made.gaussians, after, ClampParams(), binding=binding)
     np.testing.assert_allclose(splats.means, np.asarray(made.gaussians.means) @ R.T + shift, atol=2e-6)
     np.testing.assert_allclose(splats.factors, R @ np.asarray(as_splats(made.gaussians).factors), atol=2e-6)
+
+
+@pytest.mark.parametrize("mode", ["aligned", "fixed"])
+def test_colours_turn_with_the_matter(own, mode):
+    """In every mode: splats of its own turn even where those of the capture keep their shape."""
+    made, particles, binding = own
+    sh = jnp.concatenate([made.gaussians.sh, jnp.zeros((len(made.gaussians), 3, 3))], 1)
+    scene = dataclasses.replace(made.gaussians, sh=sh)
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    after = moved(particles, particles.x @ turn.T, turn)
+    splats = deform(scene, after, ClampParams(), mode=mode, binding=binding)
+    np.testing.assert_allclose(splats.sh_rotations, np.tile(turn, (len(scene), 1, 1)), atol=1e-5)
 
 
 @pytest.mark.parametrize("mode", ["aligned", "covariance"])

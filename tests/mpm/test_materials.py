@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pigjax.core.errors import InputError
-from pigjax.mpm.materials import LAWS, PRESETS, Material, material_table, plasticine, preset, respond, snow
+from pigjax.mpm.materials import LAWS, PRESETS, Material, material_table, plastic, plasticine, preset, respond, snow
 from pigjax.mpm.materials.elastic import _first_invariant, left_stretch
 from pigjax.mpm.materials.fibres import fibre_direction
 from pigjax.mpm.materials.fluid import tait_pressure
@@ -316,11 +316,11 @@ def test_plasticine_follows_its_softening_envelope(x64):
     m = parameters("plasticine", yield_stress=yield_stress, hardening_modulus=modulus, residual_stress=residual)
     stretch = jnp.asarray([0.004, 0.02, 0.04, 0.3])
     trial = stretch * jnp.asarray([[1.0], [-0.5], [-0.5]])
-    strain, hardening = plasticine.return_map(trial, jnp.zeros(4), m)
-    plastic = np.maximum(stretch - yield_stress / (3 * MU), 0)
-    softened = np.maximum(yield_stress + modulus * plastic, residual)
+    strain, hardening = plastic.perfect_von_mises(trial, jnp.zeros(4), m)
+    flow = np.maximum(stretch - yield_stress / (3 * MU), 0)
+    softened = np.maximum(yield_stress + modulus * flow, residual)
     stress = plasticine.stress(strain, hardening, m)
-    np.testing.assert_allclose(hardening, plastic, atol=1e-15)
+    np.testing.assert_allclose(hardening, flow, atol=1e-15)
     np.testing.assert_allclose((stress[0] - stress[1])[1:], softened[1:], rtol=1e-12)
     np.testing.assert_allclose((stress[0] - stress[1])[0], 3 * MU * 0.004, rtol=1e-12)
     half = plasticine.stress(strain / 2, hardening, m)
@@ -332,7 +332,7 @@ def test_plasticine_softened_to_nothing_bears_pressure_only(x64):
     m = parameters("plasticine", yield_stress=1e3, hardening_modulus=-1e4)
     gone = jnp.full(3, 0.2)
     strain = jnp.asarray([[0.01, 0.004, -0.01], [0.01, -0.004, -0.02], [0.01, 0.0, -0.03]])
-    stress = plasticine.stress(*plasticine.return_map(strain, gone, m), m)
+    stress = plasticine.stress(*plastic.perfect_von_mises(strain, gone, m), m)
     np.testing.assert_allclose(stress[:, :2], 0, atol=1e-12)
     np.testing.assert_allclose(stress[:, 2], BULK * -0.06, rtol=1e-12)
 

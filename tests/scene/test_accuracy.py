@@ -20,6 +20,7 @@ from pigjax.core.errors import SceneError
 from pigjax.scene import load_scene, scene_from
 from pigjax.scene.accuracy import LEVELS
 from pigjax.scene.plan import make_cameras, provenance, read_inputs, render_config
+from pigjax.scene.schema import values_of
 from pigjax.splat import RenderConfig
 
 EXAMPLE = Path(__file__).parents[2] / "examples/tabletop/scene.toml"
@@ -74,6 +75,20 @@ def test_the_argument_wins_over_the_file(tmp_path):
     path.write_text('accuracy = "reference"\n' + EXAMPLE.read_text())
     assert load_scene(path).accuracy == "reference"
     assert load_scene(path, accuracy="draft").simulation == load_scene(EXAMPLE, accuracy="draft").simulation
+
+
+def test_a_spacing_left_to_the_objects_follows_the_level_in_files_and_states(values, tmp_path):
+    """A level scales the default dx, too: what is written down again and what states belong to must know it."""
+    open_dx = {name: value for name, value in values["simulation"].items() if name != "dx"}
+    values = {**values, "simulation": open_dx}
+    scenes = {level: scene_of(values, accuracy=level, simulation={"cfl": 0.6}) for level in LEVELS}
+    inputs = read_inputs(scenes["standard"])
+    keys = {level: provenance(scene, inputs) for level, scene in scenes.items()}
+    assert keys["draft"] != keys["standard"] != keys["reference"] != keys["draft"]
+    for level, scene in scenes.items():
+        again = scene_from(values_of(scene, tmp_path), folder=tmp_path)
+        assert again.accuracy == level
+        assert provenance(again, inputs) == keys[level]
 
 
 def test_states_belong_to_the_physics_not_to_the_word(values):

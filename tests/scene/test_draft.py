@@ -118,12 +118,19 @@ def test_a_bare_file_becomes_a_scene_that_plans(cloud, tmp_path):
     again = new(tmp_path / "my things.ply", "-o", tmp_path / "scene")
     assert isinstance(again.exception, InputError)
     assert "exists; give --overwrite" in str(again.exception)
+    (tmp_path / "scene" / "scene.toml").unlink()  # as where `pigjax segment` wrote: its labels stay
+    again = new(tmp_path / "my things.ply", "-o", tmp_path / "scene")
+    assert "labels.npz: exists; give --overwrite" in str(again.exception)
 
 
 def test_a_single_thing_is_one_object(tmp_path):
-    io.save_ply(tmp_path / "ball.ply", splats(sphere(np.zeros(3), 0.3, 600, np.random.default_rng(2))))
-    assert new(tmp_path / "ball.ply", "-o", tmp_path / "scene", "--up", "y").exit_code == 0
+    points = np.concatenate([sphere(np.zeros(3), 0.3, 600, np.random.default_rng(2)), [[np.nan] * 3]])
+    io.save_ply(tmp_path / "ball.ply", splats(points))
+    said = new(tmp_path / "ball.ply", "-o", tmp_path / "scene", "--up", "y")
+    assert said.exit_code == 0
+    assert "1 Gaussians hold NaN" in " ".join(said.output.split())
     scene = load_scene(tmp_path / "scene" / "scene.toml")
+    assert scene.input.drop_invalid
     assert (list(scene.objects), scene.input.labels, scene.world.up) == (["part_1"], None, "y")
     assert scene.world.origin[1] == pytest.approx(-0.3, abs=0.02)
     assert scene.planes["ground"].point[2] == 0

@@ -321,5 +321,9 @@ def test_the_command_prints_prices_and_writes_the_scene(tmp_path, monkeypatch):
     planned = load_scene(tmp_path / "planned.toml")
     assert planned.simulation.dx < 0.08
     assert jnp.isfinite(planned.simulation.dx)
+    again = CliRunner().invoke(
+        app, ["plan", str(tmp_path / "scene.toml"), "--error", "8%", "-o", str(tmp_path / "planned.toml")]
+    )
+    assert "planned.toml: exists; give --overwrite" in str(again.exception)
     refused = CliRunner().invoke(app, ["run", str(tmp_path / "scene.toml"), "--time", "1e-3"])
     assert "time = 0.001 s cannot be kept: the nearest is" in str(refused.exception)

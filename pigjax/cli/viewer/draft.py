@@ -12,7 +12,7 @@ from pigjax import io
 from pigjax.core.errors import InputError, SceneError
 from pigjax.mpm.materials import PRESETS
 from pigjax.scene import Scene, scene_from
-from pigjax.scene.schema import INPUT_FILES
+from pigjax.scene.schema import INPUT_FILES, OF_MATTER, OF_MOTION, OF_STILL
 
 GROUND = "ground"
 _ROUND = 6  # digits of numbers from a page
@@ -71,21 +71,19 @@ class Draft:
         self.objects.pop(name, None)
 
     def make_fixed(self, name: str) -> None:
-        """Make an object a still collider, without material and velocity."""
-        table = self.objects[name]
-        kept: dict[str, Any] = {key: table[key] for key in ("id", "friction") if key in table}
+        """Make an object a still collider, without material, velocity and splats of its own."""
+        kept = {key: value for key, value in self.objects[name].items() if key not in OF_MATTER + OF_MOTION}
         self.objects[name] = {**kept, "fixed": True}
 
     def set_material(self, name: str, preset: str) -> None:
-        """Make an object of a preset's matter; its own numbers go.
+        """Make an object of a preset's matter; its own numbers go, its place and motion stay.
 
         Raises:
             SceneError: there is no such preset.
         """
         if preset not in PRESETS:
             raise SceneError(f"objects.{name}.material = {preset!r}: choose one of {', '.join(PRESETS)}.")
-        table = self.objects[name]
-        kept: dict[str, Any] = {key: table[key] for key in ("id", "velocity") if key in table}
+        kept = {key: value for key, value in self.objects[name].items() if key not in OF_MATTER + OF_STILL}
         self.objects[name] = {**kept, "material": preset}
 
     def set_number(self, name: str, field: str, value: float | int) -> None:

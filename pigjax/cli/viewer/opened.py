@@ -104,11 +104,12 @@ def _open_splats(path: Path, drop_invalid: bool, origin: Any, up: Up) -> Opened:
     origin = origin or io.origin_of(path)
     gaussians = io.load_gaussians(path, drop_invalid=drop_invalid, origin=origin)
     ids, names, notes = np.ones(len(gaussians), np.int32), {1: io.safe_name(path.stem)}, []
-    stored = path.parent / "labels.npz"
+    stored, labelled = path.parent / "labels.npz", False
     if stored.is_file():
         try:
             ids = io.load_labels(stored, len(gaussians), scene=io.digest_of_scene(gaussians)).object_id
             names = {int(number): f"object-{number}" for number in np.unique(ids[ids > 0])}
+            labelled = True
         except InputError as error:
             notes.append(f"labels.npz beside it is not its own: {error}")
     values = new_values(gaussians, path.name, names, up)
@@ -116,7 +117,7 @@ def _open_splats(path: Path, drop_invalid: bool, origin: Any, up: Up) -> Opened:
         values["input"]["origin"] = [float(value) for value in origin]
     if drop_invalid:
         values["input"]["drop_invalid"] = True
-    if len(names) > 1:
+    if labelled:
         values["input"]["labels"] = stored.name
     return _of_splats(path.name, path.parent, gaussians, ids, names, values, notes)
 
@@ -141,7 +142,7 @@ def _open_run(path: Path) -> Opened:
     run = load_run(path)
     names = {number: name for name, number in run.ids.items()}
     values = read_file(path / "scene.toml", "scene file")
-    return Opened(path.name, path, run.gaussians, run.object_id, names, values, path, accuracy="standard", run=run)
+    return Opened(path.name, path, run.gaussians, run.object_id, names, values, path, run=run)
 
 
 def _of_splats(

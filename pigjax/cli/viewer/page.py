@@ -152,9 +152,11 @@ class Page:
             return
         if phase == "end":
             live.release()
+            self._grabbed = None
         else:
-            if not live.holds:
+            if not live.holds or particle != self._grabbed:  # the end of another drag may have been skipped
                 live.grab(np.asarray(live.particles.x)[particle], strength=self.strength.value)
+                self._grabbed = particle
             live.drag_to(place)
         if not self.playing:
             self.stage.push_extras()

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import http
+import ipaddress
 import logging
 import re
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -39,7 +41,7 @@ def start_server(host: str = LOCAL, port: int = 8080) -> Any:
             " without it."
         ) from None
     logging.getLogger("websockets").setLevel(logging.ERROR)  # closed tabs are no errors
-    with _guarded(local=_NAMES.fullmatch(host) is not None), _silent():
+    with _guarded(local=_is_local(host)), _silent():
         try:
             server = viser.ViserServer(host=host, port=port, verbose=False)
         except (OSError, RuntimeError, OverflowError) as error:
@@ -48,6 +50,15 @@ def start_server(host: str = LOCAL, port: int = 8080) -> Any:
     server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
     server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large", dark_mode=False)
     return server
+
+
+def _is_local(host: str) -> bool:
+    """Whether an address is reached from this machine alone."""
+    try:
+        found = socket.getaddrinfo(host.strip("[]"), None)
+    except (OSError, UnicodeError):
+        return False  # which the server refuses
+    return all(ipaddress.ip_address(entry[4][0]).is_loopback for entry in found)
 
 
 def refused(headers: Any, *, local: bool) -> bool:

@@ -32,7 +32,7 @@ from pigjax.mpm.implicit.krylov import (
     stabilized_gradients,
 )
 from pigjax.mpm.implicit.stiffness import forces, masses, stiffness, tangents
-from pigjax.mpm.materials import LAWS
+from pigjax.mpm.materials import law_of
 from pigjax.mpm.substep import StepContext, StepStatics, apply_boundaries, free_velocity
 
 _CONTACT = 1.0  # stiffness of the penalty, relative to the diagonal of the matter's
@@ -176,7 +176,7 @@ def _direction(
         inside = free(r)
         return inside / step.scale + (r - inside) / (step.scale + step.hold)
 
-    symmetric = all(LAWS[law].total and not LAWS[law].hardens for law in step.statics.laws)
+    symmetric = all(law_of(law).total and not law_of(law).hardens for law in step.statics.laws)
     solve = conjugate_gradients if symmetric else stabilized_gradients
     about = precondition(diagonal, modes, coarse + in_modes(held, modes))
     steps = step.statics.krylov_steps

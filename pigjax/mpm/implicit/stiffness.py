@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from pigjax.mpm.by_law import by_component
 from pigjax.mpm.layout import State
-from pigjax.mpm.materials import LAWS, Parameters, respond
+from pigjax.mpm.materials import Parameters, law_of, respond
 from pigjax.mpm.materials.tensors import cofactors, determinant, identity, product
 from pigjax.mpm.substep import StepContext, StepStatics, parameters_of
 from pigjax.mpm.transfers import (
@@ -103,7 +103,9 @@ def stiffness(statics: StepStatics, context: StepContext, states: tuple[Any, ...
     def visit(law, parameters, state):
         own = parameters if state.row is None else parameters_of(parameters, state.row[0])
         at = _stencil(statics, context, state)
-        spring = state.volume[0] * LAWS[law].modulus(own) * (kernel.inverse_inertia * context.dt / context.grid.dx) ** 2
+        spring = (
+            state.volume[0] * law_of(law).modulus(own) * (kernel.inverse_inertia * context.dt / context.grid.dx) ** 2
+        )
         return at, no_fuse(context.opaque_true, partial(_squares, kernel), at.distance, spring)
 
     return _over_chunks(statics, context, states, visit)[..., :1]

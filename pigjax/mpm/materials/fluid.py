@@ -22,6 +22,11 @@ def newtonian(J: Scalars, rate: Tensors, m: Parameters) -> Tensors:
     return J * (2 * m.viscosity * deviator(symmetric) - tait_pressure(J, m) * identity(rate))
 
 
+def inviscid(J: Scalars, m: Parameters) -> Scalars:
+    """Principal value −J p of the stress of `newtonian` where η is zero."""
+    return -J * tait_pressure(J, m)
+
+
 def volume_ratio(J: Scalars, rate: Tensors, dt: Scalar) -> Scalars:
     """J after a step, J (1 + dt tr ∇v): the determinant of I + dt ∇v would let mere rotation create volume.
 

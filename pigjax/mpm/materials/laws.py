@@ -57,14 +57,28 @@ def respond(model: str, F: Tensors, rate: Tensors, dt: Scalar, hardening: Scalar
 
 
 def law_of(model: str) -> Law:
-    """The law of that name.
+    """The law of that name, one of `LAWS` or what remains of one (`remaining_law`).
 
     Raises:
         InputError: there is no law of that name.
     """
-    if model not in LAWS:
+    law = LAWS.get(model, _REMAINING.get(model))
+    if law is None:
         raise InputError(f"Material model {model!r} is unknown: choose one of {', '.join(sorted(LAWS))}.")
-    return LAWS[model]
+    return law
+
+
+def remaining_law(model: str, is_zero: Callable[[str], bool]) -> str:
+    """Name of the law without the terms of a number that is zero, which `is_zero` tells by its name.
+
+    The step that remains traces nothing of that number. Most laws have no such term, and stay as they are.
+    """
+    number = _DROPPED.get(model)
+    return model if number is None or not is_zero(number) else _without(model, number)
+
+
+def _without(model: str, number: str) -> str:
+    return f"{model} without {number}"
 
 
 Modulus: TypeAlias = Callable[..., Scalars]
@@ -162,21 +176,53 @@ def _rigid(F: Tensors, rate: Tensors, dt: Scalar, hardening: Scalars | None, m: 
     return Response(F + dt * product(rate, F), hardening, jnp.zeros_like(F))
 
 
+def _inviscid(F: Tensors, rate: Tensors, dt: Scalar, hardening: Scalars | None, m: Parameters) -> Response:
+    J = fluid.volume_ratio(determinant(F), rate, dt)
+    eye = identity(F)
+    return Response(jnp.cbrt(J) * eye, hardening, fluid.inviscid(J, m) * eye)
+
+
+def _unhardened_snow(
+    stretches: Float[Array, "3 *n"], hardening: Scalars, dt: Scalar, m: Parameters
+) -> tuple[Float[Array, "3 *n"], Scalars, Float[Array, "3 *n"]]:
+    stretches, hardening = snow.crumble(stretches, hardening, m)
+    return stretches, hardening, snow.unhardened_stress(stretches, m)
+
+
 _RIGID_SPEED = 20.0  # of waves that rigid matter would have by the length of its steps [m/s]: soft jelly's, and cheap
 
+_SNOW_NEEDS = ("critical_compression", "critical_stretch")
 LAWS = {
     **{name: _elastic(stress, **more) for name, (stress, more) in _HYPERELASTIC.items()},
     **{TEARING + name: _tearing(stress, **more) for name, (stress, more) in _HYPERELASTIC.items()},
     "von_mises": _plastic(_hencky(plastic.von_mises), needs=("yield_stress",)),
-    "plasticine": _plastic(_hencky(plasticine.return_map, plasticine.stress), needs=("yield_stress",)),
+    "plasticine": _plastic(_hencky(plastic.perfect_von_mises, plasticine.stress), needs=("yield_stress",)),
     "drucker_prager": _plastic(_hencky(plastic.drucker_prager), needs=("friction_angle",)),
     "snow": _plastic(
         _snow,
-        needs=("critical_compression", "critical_stretch"),
+        needs=_SNOW_NEEDS,
         modulus=lambda m: _pressure_modulus(m) * snow.largest_hardening_factor(m),
     ),
     "foam": _plastic(_foam, needs=("yield_stress", "viscosity", "flow_exponent"), hardens=False),
     "fluid": Law(_fluid, ("bulk",), total=False, hardens=False, modulus=lambda m: m.bulk),
     "rigid": Law(_rigid, (), total=True, hardens=False, modulus=lambda m: m.density * _RIGID_SPEED**2),
     "stationary": Law(None, (), total=True, hardens=False, modulus=lambda m: jnp.zeros_like(m.density)),
+}
+
+# the number at whose zero a law loses terms, and what remains of it
+_DROPPED = {
+    "von_mises": "hardening_modulus",
+    "plasticine": "hardening_modulus",
+    "snow": "hardening_coefficient",
+    "fluid": "viscosity",
+}
+_PERFECT = _plastic(_hencky(plastic.perfect_von_mises), needs=("yield_stress",))
+_REMAINING = {
+    _without(model, _DROPPED[model]): law
+    for model, law in {
+        "von_mises": _PERFECT,
+        "plasticine": _PERFECT,
+        "snow": _plastic(_unhardened_snow, needs=_SNOW_NEEDS),
+        "fluid": LAWS["fluid"]._replace(respond=_inviscid),
+    }.items()
 }

@@ -31,6 +31,13 @@ def von_mises(strain: Strains, hardening: Scalars, m: Parameters) -> tuple[Strai
     return shortened(strain, flow), hardening + root * flow
 
 
+def perfect_von_mises(strain: Strains, hardening: Scalars, m: Parameters) -> tuple[Strains, Scalars]:
+    """Radial return of principal strains [3 *n] to the yield stress as given; the equivalent plastic strain grows."""
+    root = (2 / 3) ** 0.5
+    flow = jnp.maximum(length(strain - strain.mean(0)) - root * m.yield_stress / (2 * m.mu), 0.0)
+    return shortened(strain, flow), hardening + root * flow
+
+
 def drucker_prager(strain: Strains, hardening: Scalars, m: Parameters) -> tuple[Strains, Scalars]:
     """Non-associated return to ‖dev τ‖ + α (tr τ − 3 c cot φ) ≤ 0 (Klar et al. 2016, doi 10.1145/2897824.2925906).
 

@@ -10,17 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pigjax.mpm.materials.parameters import Parameters
-from pigjax.mpm.materials.plastic import shortened
-from pigjax.mpm.materials.tensors import Scalars, length
+from pigjax.mpm.materials.tensors import Scalars
 
 Strains = Float[Array, "3 *n"]
-
-
-def return_map(strain: Strains, hardening: Scalars, m: Parameters) -> tuple[Strains, Scalars]:
-    """Radial return of principal strains [3 *n] to the undamaged yield stress; the equivalent plastic strain grows."""
-    root = (2 / 3) ** 0.5
-    flow = jnp.maximum(length(strain - strain.mean(0)) - root * m.yield_stress / (2 * m.mu), 0.0)
-    return shortened(strain, flow), hardening + root * flow
 
 
 def damage(hardening: Scalars, m: Parameters) -> Scalars:

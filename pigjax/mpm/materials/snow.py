@@ -41,6 +41,10 @@ def largest_hardening_factor(m: Parameters) -> Scalars:
 
 def stress(stretches: Stretches, hardening: Scalars, m: Parameters) -> Stretches:
     """Principal Kirchhoff stresses [Pa] of hardened fixed corotated elasticity, 2μ s (s − 1) + λ J (J − 1)."""
+    return hardening_factor(hardening, m) * unhardened_stress(stretches, m)
+
+
+def unhardened_stress(stretches: Stretches, m: Parameters) -> Stretches:
+    """The same before any hardening, and where ξ is zero."""
     J = stretches.prod(0)
-    unhardened = 2 * m.mu * stretches * (stretches - 1) + m.lam * J * (J - 1)
-    return hardening_factor(hardening, m) * unhardened
+    return 2 * m.mu * stretches * (stretches - 1) + m.lam * J * (J - 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -17,7 +17,7 @@ from pigjax.core.arguments import checked
 from pigjax.core.arrays import static_field
 from pigjax.core.checks import Limits, is_numeric, shown
 from pigjax.core.errors import InputError
-from pigjax.mpm.materials.laws import law_of
+from pigjax.mpm.materials.laws import law_of, remaining_law
 from pigjax.mpm.materials.parameters import Parameters
 
 
@@ -145,6 +145,26 @@ class MaterialTable(Parameters):
     def rows(self, index: int | Int[Array, "*p"] | Int[np.ndarray, "*p"]) -> Parameters:
         """Numbers of one row, or of the row of each particle."""
         return Parameters(**{f.name: getattr(self, f.name)[index] for f in fields(Parameters)})
+
+    def required(self) -> MaterialTable:
+        """The same table whose laws lack the terms of viscosity or hardening where they are zero.
+
+        A law loses its term where the number is known, not traced, and zero in all its rows: the program of a
+        simulation then has no operation for it. Another value asked for later makes another program.
+        """
+
+        def remaining(law: str) -> str:
+            return remaining_law(law, lambda number: self._is_zero(law, getattr(self, number)))
+
+        known = {law: remaining(law) for law in dict.fromkeys(self.laws)}
+        laws = tuple(known[law] for law in self.laws)
+        return self if laws == self.laws else replace(self, laws=laws)
+
+    def _is_zero(self, law: str, values: Float[Array, "m"]) -> bool:
+        """Whether values are known and zero in all rows of a law."""
+        if isinstance(values, jax.core.Tracer):
+            return False
+        return not np.any(np.asarray(values)[..., [other == law for other in self.laws]])
 
     @property
     @partial(jax.jit, inline=True)
