@@ -371,7 +371,7 @@ def materials_page() -> str:
     ]) + "\n"  # fmt: skip
 
 
-TEXT_OF_MATERIALS = """A material is a law with its numbers, in SI units. A preset is a material with an everyday name; its numbers can be replaced one by one:
+TEXT_OF_MATERIALS = """A material is a law with its parameters, in SI units. A preset is a material with an everyday name; its parameters can be replaced one by one:
 
 ```toml
 [objects.duck]
@@ -383,14 +383,14 @@ young = 8e3        # softer than the preset's 20 kPa
 
 TEXT_OF_SOFTENING = """## Why metal is soft here
 
-Real aluminium has 69 GPa and real steel 200 GPa; the preset `metal` has 5 MPa. `rubber` and `sand` are softer than most real ones, and `water` is compressed ten thousand times more easily. The reason is the explicit step: a pressure wave may cross less than a cell in it, so the step is proportional to dx / √(E/ρ). A step of real steel is a microsecond on a grid of a centimetre, which makes some 40,000 steps a frame. A stiff body whose waves are a hundred times slower still looks rigid in a video, as long as its own weight and its impacts deform it little: ρ g h ≪ E and ρ v² ≪ E. The preset keeps the density of aluminium, so that it pushes others as aluminium does. Its yield stress is lowered with its stiffness: it dents where the stress of an impact, ρ c v, reaches 100 kPa, from about 0.7 m/s; soft aluminium dents from about 2 m/s.
+Young's modulus of real aluminium is 69 GPa and of real steel 200 GPa; that of the preset `metal` is 5 MPa. `rubber` and `sand` are softer than most real ones, and `water` is ten thousand times more compressible. The reason is the explicit step: a pressure wave may cross less than a cell per step, so the step is proportional to dx / √(E/ρ). For real steel on a grid of a centimetre it is a microsecond, hence some 40,000 steps a frame. A stiff body whose waves are a hundred times slower still looks rigid in a video, as long as its own weight and its impacts deform it little: ρ g h ≪ E and ρ v² ≪ E. The preset keeps the density of aluminium, so that it pushes other objects as aluminium does. Its yield stress is lowered with its stiffness: it dents where the stress of an impact, ρ c v, reaches 100 kPa, from about 0.7 m/s; soft aluminium dents from about 2 m/s.
 
-What this means:
+Consequences:
 
-- Weight, friction, flow and shape at rest are those of the named matter. The pitch of vibrations, the duration of an impact and the depth of a dent in `metal` are not: it does not tell forces or stresses of a real part.
-- `steel` and `stone` keep the real moduli. They need `simulation.integrator = "implicit"` or slow motion. An object that need not deform is cheaper as `rigid = true`, which takes its density alone, or as `fixed = true` where it stands still.
-- The `bulk_modulus` of water only has to keep it from being squeezed visibly: waves should be ten times as fast as the flow (Monaghan 1994). The preset's 14 m/s serve flows of up to about 1.4 m/s, that is falls of 10 cm. For higher falls raise it with the square of the speed.
-- To fit numbers to a real object, tune them against its video: [studies](STUDIES.md). Only E/ρ can be seen in a video without known forces."""  # noqa: E501
+- Weight, friction, flow and shape at rest are those of the named matter. The pitch of vibrations, the duration of an impact and the depth of a dent in `metal` are not: do not use it to predict forces or stresses of a real part.
+- `steel` and `stone` have the real moduli. They need `simulation.integrator = "implicit"` or slow motion. An object that need not deform is cheaper with `rigid = true`, which uses only its density, or with `fixed = true` if it does not move.
+- The `bulk_modulus` of water only has to prevent visible compression: waves should be ten times as fast as the flow (Monaghan 1994). The preset's 14 m/s suffice for flows up to about 1.4 m/s, that is falls of 10 cm. For higher falls raise `bulk_modulus` with the square of the speed.
+- To fit parameters to a real object, tune them against its video: [studies](STUDIES.md). Without known forces a video determines only E/ρ."""  # noqa: E501
 
 
 def pages() -> dict[Path, str]:

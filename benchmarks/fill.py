@@ -1,4 +1,4 @@
-"""What stays when objects leave: the tabletop's table, filled where six objects hid it, beside the table alone.
+"""Filling of hidden surfaces: the tabletop's table, filled where six objects hid it, beside the table alone.
 
 The table alone was rendered from the same cameras; those pictures are in `--data`, in `tabletop/empty`.
 """

@@ -1,4 +1,4 @@
-"""Splats of its own: their picture at rest, and in motion beside the clamp and a dense reference.
+"""Own splats: their picture at rest, and in motion beside the clamp and a dense reference.
 
 `rest`: objects of the bundled tabletop drawn by splats as fine as their particles, in views not used for their fit.
 `motion`: the same objects drawn to a thread and wound, as in the ablation, by splats of the capture and by own ones.

@@ -1,4 +1,4 @@
-"""Rigid bodies: how deep they sink by the rounds of contact and in water, and what a body costs beside other matter.
+"""Rigid bodies: depth of contact by rounds, floating, and the cost of a body beside other matter.
 
 rounds: a box falls tilted onto a floor, with few rounds of contact and with many: depth, tilt and time a substep.
 floating: a block of wood in a tank, by cells: the share of it under the water's level, beside that of Archimedes.
@@ -99,8 +99,8 @@ def floating(options):
         each = f"{under.mean():.3f}", spread, f"{over:.3f}", f"{under.mean() / wanted / over:.3f}"
         print(row(cells, len(particles), frames * steps, *each))
     return (
-        f"\nWanted: {wanted:.2f}. Means, least and most of the second half of 2 s; the water's level is twice the mean "
-        "height of what is apart from the block."
+        f"\nExpected: {wanted:.2f}. Mean, minimum and maximum over the second half of 2 s; the water's level is twice "
+        "the mean height of the water apart from the block."
     )
 
 

@@ -1,4 +1,4 @@
-"""Shadows: what they cost beside a picture, by the samples of the light.
+"""Shadows: cost relative to a picture, by the samples of the light.
 
 The tabletop in its rest pose; what stands on the table casts. Drawing and shadows are timed in turn, in one process.
 """
@@ -46,6 +46,6 @@ def price(options) -> str:
     )
 
 
-PARTS = {"price": ("Price of shadows", price)}
+PARTS = {"price": ("Cost of shadows", price)}
 OPTIONS = {"samples": {"nargs": "+", "type": int, "default": [1, 8], "help": "of the light"}}
 DEVICES = None

@@ -401,26 +401,25 @@ def paragraph(text):
 
 
 PREFACE = """
-Every law that moves meets every extreme: 125 particles of two materials in 16³ nodes, E = 2e4 Pa, ν = 0.3, 1,000
-kg/m³, 200 steps of the stable length unless stated, longer ones forced. A cell tells the counts of `Health` (`esc` left
-the grid, `inv` turned inside out, `nan` became NaN or infinite, `cfl` cells in a step; `ok` nothing), then a number:
-*energy*, the most kinetic energy of any frame in parts of that given; *momentum*, lost share; *others*, how far
-[cells] the other particles are from where they go without that one; *distance*, relative error of the distance in
-free flight; *cells*,
-difference from the scene of ordinary size, scaled back; *spacings*, difference from the origin in spacings of
-floating point there. Plastic laws and fluids put an F that is flat or inside out in order before the first step.
-Particles that no field counts are finite: the benchmark stops otherwise. Snow makes energy (1.30) where ν nears 0.5:
-its flow bounds each stretch by itself, which turns shear into pressure.
+Every moving law at every extreme: 125 particles of two materials in 16³ nodes, E = 2e4 Pa, ν = 0.3, 1,000 kg/m³, 200
+steps of the stable length unless stated, longer ones forced. A cell lists the counts of `Health` (`esc` left the grid,
+`inv` were inverted, `nan` became NaN or infinite, `cfl` cells in a step; `ok` none), then a number: *energy*, the
+largest kinetic energy of any frame relative to the initial one; *momentum*, lost share; *others*, how far [cells] the
+other particles are from their places without that one; *distance*, relative error of the distance in free flight;
+*cells*, difference from the scene of ordinary size, scaled back; *spacings*, difference from the origin in spacings of
+floating point there. Plastic laws and fluids correct a flat or inverted F before the first step. Particles that no
+count includes are finite: the benchmark stops otherwise. Snow gains energy (1.30) where ν nears 0.5: its flow bounds
+each stretch separately, which turns shear into pressure.
 """
 MARGINS = """
-Stable steps (`cfl` = 0.4) at which a cube breaks down: `Health` counts something, or kinetic energy is more than
-twice that of a quarter step. In quarters.
+Stable steps (`cfl` = 0.4) at which a cube breaks down: `Health` counts something, or kinetic energy is more than twice
+that of a quarter step. In quarters.
 """
 TRADE = """
-A cube thrown at the floor, after the time of 80 stable steps: how far its particles are from where steps a tenth as
-long bring them [cells, rms], and the kinetic energy left. The time that a simulation takes is inverse to the length of
-its steps. Shorter steps are not nearer to the truth: each transfer to the grid and back damps, and elastic matter that
-should keep its energy loses more of it in more steps.
+A cube thrown at the floor, after the time of 80 stable steps: the distance of its particles from their places with
+steps a tenth as long [cells, rms], and the remaining kinetic energy. The time of a simulation is inversely proportional
+to the length of its steps. Shorter steps are not nearer to the truth: each transfer to the grid and back damps, and
+elastic matter that should keep its energy loses more of it in more steps.
 """
 
 EDGES = ("squeezed by 3 %, free", "thrown at the floor at c/10", "at c/2")

@@ -1,4 +1,4 @@
-"""Every cell of docs/DIFFERENTIABILITY.md by its derivative in reverse mode, central differences and a large change."""
+"""Every cell of docs/DIFFERENTIABILITY.md by its derivative in forward mode, central differences and a large change."""
 
 import dataclasses
 import functools

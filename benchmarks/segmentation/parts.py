@@ -16,7 +16,7 @@ STUDIES = {
     "votes": ("Votes on a cloud with known ids", votes.study),
     "trained": ("Objects of a reconstructed scene", trained.study),
     "refit": ("Boundaries refit", refit.study),
-    "comparison": ("Beside rivals' methods", comparison.compare),
+    "comparison": ("Comparison with other methods", comparison.compare),
     "association": ("Masks without consistent ids", association.study),
     "noise": ("Noisy masks", noise.study),
     "sweep": ("Thresholds, views, resolution", sweep.study),

@@ -34,7 +34,7 @@ def study(options) -> str:
     """Tables of all scenes and one plot."""
     print(
         "One picture of the deformed scene. Reference: the exact setting (alpha ≥ 1e-6, no early stop) in float64. Of a"
-        " smaller picture the error is that of the picture enlarged.\n"
+        " smaller picture the error is measured after enlargement.\n"
     )
     return by_scene(options, lambda name: (_study(name), None, ""), PLOT, error="RMS error of colour")
 

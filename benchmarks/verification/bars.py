@@ -56,11 +56,11 @@ def period(cells, mode, kernel="quadratic", simulate=simulate):
 
 @in_float64
 def bars():
-    """A bar of E = 10 kPa, ν = 0 and 4 particles a cell swings in its first mode at 0.1 mm/s; the period is that of a
-    cosine fitted to 2.5 periods of the mode's velocity. The free bar converges with second order. The foot of the fixed
-    bar stands on the last node of a sticky wall, and there first order remains: the nodes of the wall hold zero where a
-    field that is linear through zero would turn negative, so the velocity leaves the wall with zero slope, the first
-    cell is softer than the matter, and the bar acts a fifth of a cell too long.
+    """A bar of E = 10 kPa, ν = 0 and 4 particles a cell oscillates in its first mode at 0.1 mm/s; the period is that of
+    a cosine fitted to 2.5 periods of the mode's velocity. The free bar converges with second order. The foot of the
+    fixed bar stands on the last node of a sticky wall, which leaves first order: the velocity of the wall's nodes is
+    zero, where a linear field would be negative, so the velocity has zero slope at the wall, the first cell is softer
+    than the matter, and the bar behaves as if it were a fifth of a cell longer.
     """
     rows, errors = [], {}
     for mode, source in (("free", "2 L/c"), ("fixed", "4 L/c")):

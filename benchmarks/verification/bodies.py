@@ -65,14 +65,14 @@ def parting(t, approach):
 
 
 def two_discs():
-    """Two discs of 0.2 m, E = 1 kPa, ν = 0.3 in plane strain, thrown at each other along the
-    diagonal with 0.1 m/s a component (Sulsky, Chen and Schreyer 1994, doi 10.1016/0045-7825(94)90112-0).
+    """Two discs of 0.2 m, E = 1 kPa, ν = 0.3 in plane strain, thrown at each other along the diagonal with 0.1 m/s a
+    component (Sulsky, Chen and Schreyer 1994, doi 10.1016/0045-7825(94)90112-0).
 
-    In the single field bodies meet on the grid, so they feel each other about a cell before they touch, and pull on
-    each other as they part: `pull` is the share of the speed of separation that this takes. With `BodyContact` they
-    meet within a cell of where they touch (the row counts from a loss of 1 % of the speed), part earlier, and nothing
-    pulls. The energy that the centres of mass lose is physical in part: it stays in the discs as vibration, of which
-    APIC then damps the part that the grid cannot resolve. `energy kept` is kinetic and strain energy together at 3.6 s.
+    In the single field bodies interact through the grid about a cell before they touch, and attract each other as they
+    separate: `pull` is the share of the separation speed that this takes. With `BodyContact` contact begins within a
+    cell of touching (the row counts from a loss of 1 % of the speed), ends earlier, and there is no attraction. The
+    energy that the centres of mass lose is partly physical: it remains in the discs as vibration, of which APIC damps
+    the part that the grid does not resolve. `energy kept` is kinetic and strain energy together at 3.6 s.
     """
     rows, series = [], {}
     apart = BodyContact(bodies=2)
@@ -143,10 +143,10 @@ def sag(cells, slender=8, periods=1.25):
 
 @in_float64
 def cantilever():
-    """A beam eight times as long as thick, ν = 0, 2x2 particles a cell, held by a
-    sticky wall, sags by one per cent of its length under a gravity applied at once. It swings about the static sag,
-    the mean of a damped cosine fitted to 1.25 periods. The closed form is Timoshenko's, ρ g A L⁴/8EI + ρ g L²/2κG
-    with κ = 5/6. First order by the wall: see the fixed bar.
+    """A beam eight times as long as thick, ν = 0, 2x2 particles a cell, held by a sticky wall, sags by one per cent of
+    its length under a suddenly applied gravity. It oscillates about the static sag, the mean of a damped cosine fitted
+    to 1.25 periods. The closed form is Timoshenko's, ρ g A L⁴/8EI + ρ g L²/2κG with κ = 5/6. The wall makes it first
+    order: see the fixed bar.
     """
     rows, series = [], []
     for cells in (2, 4, 8):
@@ -211,9 +211,9 @@ def modulus(cells, *, axes, strain=0.005, transits=10):
 @in_float64
 def plates():
     """A block, E = 100 kPa, ν = 0.3, between frictionless plates that close by half a per cent over ten transits of the
-    pressure wave: along one axis with the others held, and along all three. The modulus is the slope of the particles'
-    mean pressure over the volume that the plates take. Each plate lies on a node and holds it; first order, since the
-    matter's first cell at a plate is softer, as in the fixed bar.
+    pressure wave: along one axis with the others fixed, and along all three. The modulus is the slope of the particles'
+    mean pressure over the change of volume. Each plate coincides with a layer of nodes; the error is of first order,
+    since the matter's first cell at a plate is softer, as in the fixed bar.
     """
     rows, series = [], {}
     for name, axes, sizes in (("λ + 2μ", (2,), (10, 20, 40)), ("K", (0, 1, 2), (6, 10))):

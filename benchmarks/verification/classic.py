@@ -114,11 +114,12 @@ def _figures(kernel, force):
 
 
 def classic():
-    """Classic MPM's force, by the gradients of the weights, beside that of MLS-MPM at the same settings.
+    """The force of classic MPM, by the gradients of the weights, beside that of MLS-MPM at the same settings.
 
     One plain step on a dense grid serves both: mass, velocity and APIC's moments, law and grid are the same code. Times
     are of a substep of 10k random particles at dx = 1/64 m in float32, of the plain step, which is slower than the
-    library's. `MLS` computes what the library does; the problems are those of `kernels`, `bars` and `axis_aligned`.
+    library's. `MLS` computes the same step as the library; the problems are those of `kernels`, `bars` and
+    `axis_aligned`.
     """
     rows = []
     for kernel in KERNELS:

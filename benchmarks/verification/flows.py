@@ -36,10 +36,10 @@ def front(cells, kernel="quadratic"):
 def dam_break():
     """A column of water twice as high as wide collapses on a smooth floor in plane strain.
 
-    Sound is ten times as fast as the fall, viscosity zero. The front is the foremost particle. The first row compares
-    the front where it is, the second its speed beyond Z = 2. The offset arises mostly before Z = 1.5: the
-    experiment's gate opens in finite time, which is why published comparisons often shift the time. Finer cells let the
-    thin tongue start sooner and do not close it.
+    The speed of sound is ten times that of the fall, the viscosity is zero. The front is the foremost particle. The
+    first row compares its position, the second its speed beyond Z = 2. The offset arises mostly before Z = 1.5: the
+    experiment's gate opens in finite time, which is why published comparisons often shift the time. With finer cells
+    the thin tongue starts sooner, and the offset remains.
     """
     rows, series = [], []
     for cells in (12, 24):
@@ -123,10 +123,10 @@ def lube(aspect, axisymmetric):
 def sand():
     """Columns of dry sand between a smooth wall and open floor, in plane strain, collapse on a rough floor.
 
-    Lube et al. (2005, doi 10.1103/PhysRevE.72.041301) found the run-out a function of height over width alone, 1.2 a or
-    1.9 a^⅔. Their sands repose at about 31 degrees, so the law is given the friction angle at which an endless slope of
-    it stands at 31 degrees; no number is fitted. The edge is where the deposit is a quarter of a cell deep: half a
-    layer of particles. The deposit's foot is thin, so run-out grows a little as cells shrink.
+    Lube et al. (2005, doi 10.1103/PhysRevE.72.041301) found that the run-out depends only on height over width, a: it
+    is 1.2 a or 1.9 a^⅔. The angle of repose of their sands is about 31 degrees, so the friction angle is that at which
+    an infinite slope stands at 31 degrees; no number is fitted. The edge is where the deposit is a quarter of a cell
+    deep: half a layer of particles. The deposit's foot is thin, so the run-out grows a little as cells shrink.
     """
     return _columns("sand in plane strain", ((1.0, 16), (1.0, 24), (3.0, 12), (3.0, 18)), axisymmetric=False)
 
@@ -134,9 +134,9 @@ def sand():
 def sand_cylinder():
     """A cylinder of the same sand, a quarter of it between smooth walls.
 
-    Lube et al. (2004, doi 10.1017/S0022112004009036): 1.24 a or 1.6 √a. It spreads thinner than the columns in plane
-    strain: with as many cells it falls short by more, and gains as they shrink. The last row takes the run-out as
-    linear in the size of a cell and draws it to zero: an estimate, not a simulation.
+    Lube et al. (2004, doi 10.1017/S0022112004009036): 1.24 a or 1.6 √a. The deposit is thinner than that of the columns
+    in plane strain: with as many cells the run-out is too short by more, and it grows as cells shrink. The last row
+    extrapolates it linearly to cells of size zero: an estimate, not a simulation.
     """
     studies = (12, 24)
     case = _columns("sand cylinder", [(1.0, cells) for cells in studies], axisymmetric=True)

@@ -73,11 +73,11 @@ def substeps(kernel, simulate=simulate, count=10_000, cells=64):
 def kernels():
     """The same problems with the quadratic and the cubic kernel.
 
-    A free bar of 16 cells rings in its first mode for 20 periods from 0.05 m/s; the energy kept is
-    the mean over the last period by that over the first, since the steps know velocity and strain half a step apart. A
-    block of 6 cells a side turns once. Both in float64; 10k random particles on 64³ nodes in float32 give the time, of
-    a busy machine. APIC keeps only what an affine field holds of a particle's surroundings, and the cubic kernel's are
-    wider: it damps the bar more and costs more. Its merit is a smoother stress where particles cross cells.
+    A free bar of 16 cells oscillates in its first mode for 20 periods from 0.05 m/s; the energy kept is the mean over
+    the last period divided by that over the first, since velocity and strain are half a step apart. A block of 6 cells
+    a side turns once. Both are in float64; 10k random particles on 64³ nodes in float32 give the time, on a busy
+    machine. APIC keeps only the affine part of the velocities around a particle, and the window of the cubic kernel is
+    wider: it damps the bar more and costs more. Its advantage is a smoother stress where particles cross cells.
     """
     rows, series = [], {}
     for kernel in KERNELS:

@@ -59,11 +59,11 @@ def drifts(kernel="quadratic"):
 
 @in_float64
 def laws():
-    """Laws of nature that hold at any resolution, on a cube of 125 particles over 200 steps in float64.
+    """Laws of physics that hold at any resolution, on a cube of 125 particles over 200 steps in float64.
 
-    Momenta; free fall against symplectic Euler's closed form; a rigid turn by 0.8 rad, where the strain may be that of
-    the centripetal force. And two columns that bear their weight, as means over whole periods: an elastic one on a
-    sticky floor, a fluid one of 16 cells between slip walls. tests/mpm/test_mls_mpm.py holds more of them.
+    Momenta; free fall against symplectic Euler's closed form; a rigid turn by 0.8 rad, whose strain may be that of the
+    centripetal force; and two columns under their own weight, as means over whole periods: an elastic one on a sticky
+    floor, a fluid one of 16 cells between slip walls. tests/mpm/test_mls_mpm.py tests more of these laws.
     """
     rows = []
     for kernel in ("quadratic", "cubic"):

@@ -117,11 +117,12 @@ def axis_aligned():
     """An axis-aligned motion, u_i = A sin(π X_i) sin(π c t + φ_i), after Sadeghirad, Brannon and Burghardt (2011, doi
     10.1002/nme.3110).
 
-    A = 0.05 m, c = 10 m/s and φ = 0, 2π/3, 4π/3 in a unit cube of neo-Hookean matter between slip walls, ν = 0.3,
-    eight particles a cell, over a whole period; float32. The error is the largest root mean square over time of the
-    particles' displacement, as a share of A. The walls make it first order: as in the fixed bar, the matter acts too
-    long by part of a cell at either, which detunes the swing, and over a whole period that adds up. The same motion
-    with cosines along a bar with free ends, ν = 0, where no wall is, shows the order of the method itself; float64.
+    A = 0.05 m, c = 10 m/s and φ = 0, 2π/3, 4π/3 in a unit cube of neo-Hookean matter between slip walls, ν = 0.3, eight
+    particles a cell, over a whole period; float32. The error is the largest root mean square over time of the
+    particles' displacement, as a share of A. The walls make it first order: as in the fixed bar, the matter behaves as
+    if it were longer by part of a cell at each wall, which detunes the oscillation, and the error grows over the
+    period. The same motion with cosines along a bar with free ends and without walls, ν = 0, shows the order of the
+    method itself; float64.
     """
     rows, series = [], {}
     studies = (("cube", cube_error, (6, 12, 20)), ("free bar", in_float64(free_error), (8, 16, 32, 64)))
@@ -184,10 +185,10 @@ def vortex_error(cells, amplitude, kernel="quadratic", per_side=2):
 def vortex():
     """The generalised vortex of Brannon, Kamojjala and Sadeghirad (2011, Particle-Based Methods II).
 
-    A ring from 0.75 to 1.25 m in plane strain, E = 1 kPa, ν = 0.3, turns by A sin(π t) (1 − 32 s² + 256 s⁴) at
-    s = R − 1, to and fro in one second, with neither displacement nor traction at its faces. Particles lie on circles,
-    three by three a cell: a square lattice leaves the ring a jagged edge. The error is the largest root mean square of
-    the displacement, as a share of A times 1 m. float32.
+    A ring from 0.75 to 1.25 m in plane strain, E = 1 kPa, ν = 0.3, turns by A sin(π t) (1 − 32 s² + 256 s⁴) at s = R −
+    1, to and fro in one second, with neither displacement nor traction at its faces. Particles lie on circles, three by
+    three per cell, since a square lattice would make the edge of the ring jagged. The error is the largest root mean
+    square of the displacement, as a share of A times 1 m. float32.
     """
     rows, at_last = [], None
     for amplitude, sizes in ((0.1, (8, 16)), (1.0, (8, 16))):
