@@ -1,4 +1,9 @@
-"""Real captures: reconstruction of a folder of posed photos, and objects from their masks."""
+"""Real captures: reconstruction of a folder of posed photos, objects from their masks, and a motion of each.
+
+    python -m benchmarks real captures motion --data FOLDER --out RESULTS --write
+
+`motion` runs the scene of examples/captures for each capture that `captures` left in `--out`.
+"""
 
 import dataclasses
 import hashlib
@@ -7,13 +12,17 @@ import subprocess
 import time
 from pathlib import Path
 
+import imageio.v3 as iio
 import jax
 import jax.numpy as jnp
 import numpy as np
+from PIL import Image
 
 from benchmarks.common.command import start_worker
-from benchmarks.common.pages import ROOT, head, row
-from benchmarks.common.timing import peak_memory, use_host_devices
+from benchmarks.common.pages import EXAMPLES, ROOT, head, picture, row
+from benchmarks.common.timing import clock, peak_memory, use_host_devices
+from benchmarks.gallery import told
+from benchmarks.media import few_colours, tiles
 from pigjax import (
     FitConfig,
     RenderConfig,
@@ -27,7 +36,9 @@ from pigjax import (
     render,
     save_ply,
 )
+from pigjax.io import contact_sheet, read_toml
 from pigjax.reconstruction.train import for_capture
+from pigjax.scene import run_scene, scene_from
 
 COLUMNS = (
     "capture", "settings", "photos", "size [px]", "splats", "steps", "PSNR [dB]", "least", "gains fitted", "training",
@@ -49,6 +60,8 @@ SWITCHES = {
     "error-growth": {"start_splats": 0.25, "grow_every": 0.2, "error_views": 8},
 }
 _CAMERAS = ("transforms.json", "transforms_train.json", "cameras.json", "sparse")  # one of them makes a capture
+# captures whose pictures may be shown, with their attribution
+_SHOWN = {"dinosaur": "photos of BlendedMVS (Yao et al. 2020, doi 10.1109/CVPR42600.2020.00186), CC BY 4.0"}
 _MOST_SCORED = 12  # training photos whose score is averaged
 _LEGEND = (
     "PSNR and SSIM are means over the held-out photos, every eighth; least: the worst of them; gains fitted: mean PSNR"
@@ -115,8 +128,53 @@ def _commit() -> str:
     return said.stdout.strip()
 
 
-def worker(folder: str, size: str, steps: str, splats: str, switch: str, out: str) -> None:
-    """Reconstruct one capture, and print its line of the table."""
+def motion(options) -> str:
+    """Run the scene of each capture, and draw the sheets of those that may be shown."""
+    if options.data is None or options.out is None:
+        print("skipped: --data names no folder of captures, or --out none with their Gaussians")
+        return ""
+    print(head("capture", "shows", "splats of the objects", "particles", "frames", "s", "GB", "least J", "notes"))
+    pictures = []
+    for scene in sorted((EXAMPLES / "captures").glob("*.toml")):
+        name, made = scene.stem, (options.out / f"{scene.stem}-none.ply").resolve()
+        if options.sets and name not in options.sets:
+            continue
+        if not made.is_file():
+            print(row(name, told(scene)[0], *[""] * 6, f"skipped: no {made.name} in --out"), flush=True)
+            continue
+        said, _ = start_worker("real", "motion", scene, (options.data / name).resolve(), made).communicate()
+        lines = said.strip().splitlines()
+        done = bool(lines) and lines[-1].startswith("|")
+        print(lines[-1] if done else row(name, told(scene)[0], *[""] * 6, "failed"), flush=True)
+        if done and name in _SHOWN:
+            clip = iio.imread(made.with_suffix("") / "video.mp4")
+            size = (240, round(240 * clip.shape[1] / clip.shape[2]))
+            sheet = Image.fromarray(contact_sheet(tiles(clip, 8, size, name, named=0), 4, gap=2))
+            few_colours(sheet, 256).save(options.media / f"real_{name}.png", optimize=True)
+            pictures += ["", picture(f"real_{name}.png", f"{told(scene)[0]}; {_SHOWN[name]}"), "", f"{_SHOWN[name]}."]
+    return "\n".join(pictures)
+
+
+def _move(scene: str, data: str, made: str) -> None:
+    """Run the scene of one capture into a folder beside its Gaussians, and print its line of the table."""
+    path, out = Path(scene), Path(made).with_suffix("")
+    values = read_toml(path)
+    values["input"] = {"gaussians": made, "views": data}
+    asked = scene_from(values, folder=path.parent, where=path.name)
+    seconds, report = clock(lambda: run_scene(asked, out, overwrite=True))
+    members = ", ".join(f"{name}: {count}" for name, count in report.sizes["gaussians_of"].items())
+    sizes = [report.sizes[name] for name in ("particles", "frames")]
+    least = f"{report.health['min_J']:.3f}" if "min_J" in report.health else ""
+    notes = "; ".join(report.warnings).replace("\n", " ")
+    print(row(path.stem, told(path)[0], members, *sizes, f"{seconds:.0f}", f"{peak_memory():.1f}", least, notes))
+
+
+def worker(task: str, *arguments: str) -> None:
+    """Reconstruct or move one capture, and print its line of the table."""
+    _move(*arguments) if task == "motion" else _reconstruct(task, *arguments)
+
+
+def _reconstruct(folder: str, size: str, steps: str, splats: str, switch: str, out: str) -> None:
     use_host_devices(None)
     path, commit = Path(folder), _commit()
     masks = (path / "object_mask").is_dir() or None
@@ -183,7 +241,7 @@ def _mask_iou(gaussians, views: Views, drawing: RenderConfig) -> str:
     return f"{np.mean(scores):.3f}"
 
 
-PARTS = {"captures": ("Captures", captures), "switches": ("Settings", switches)}
+PARTS = {"captures": ("Captures", captures), "motion": ("Motion", motion), "switches": ("Settings", switches)}
 OPTIONS = {
     "data": {"type": Path, "help": "folder with a folder for each capture"},
     "sets": {"nargs": "*", "help": "names of captures; all without"},
@@ -191,6 +249,6 @@ OPTIONS = {
     "steps": {"type": int, "default": 3000, "help": "of training"},
     "splats": {"type": int, "help": "number of Gaussians; from the photos without"},
     "switch": {"nargs": "*", "choices": list(SWITCHES), "help": "settings to compare; all without"},
-    "out": {"type": Path, "help": "folder for the Gaussians (.ply)"},
+    "out": {"type": Path, "help": "folder for the Gaussians (.ply), rows of the table and runs"},
 }
 DEVICES = None

@@ -54,3 +54,18 @@ def test_data_beside_the_scene_or_in_a_folder_are_found(tmp_path):
     assert gallery.located(path, "plant.ply", tmp_path) == tmp_path / "plant.ply"
     assert gallery.told(path)[0].startswith("A houseplant sways")
     assert "Marcel Padilla" in gallery.data_of(path)
+
+
+CAPTURES = {path.stem: path for path in (FOLDER.parent / "captures").glob("*.toml")}
+
+
+@pytest.mark.parametrize("name", sorted(CAPTURES))
+def test_scene_of_a_capture_loads_and_takes_ten_lines_at_most(name):
+    """Its files are the user's: `python -m benchmarks real` names them."""
+    scene = load_scene(CAPTURES[name])
+    assert (scene.input.gaussians, scene.input.views) == (f"{name}.ply", name)
+    lines = [line for line in CAPTURES[name].read_text().splitlines() if line and not line.startswith("#")]
+    assert len(lines) <= 10
+    shows, source = gallery.told(CAPTURES[name])
+    assert shows
+    assert "pigjax reconstruct" in source
