@@ -3,13 +3,14 @@
 Each knob is turned alone from the standard, on the bundled tabletop, a jelly cube and a cube of sand (`--scenes`).
 """
 
-from benchmarks.tradeoff import drawing, matter, voting, whole
+from benchmarks.tradeoff import drawing, matter, reconstruction, voting, whole
 from benchmarks.tradeoff.scenes import SCENES
 
 PARTS = {
     "matter": ("Matter", matter.study),
     "drawing": ("Drawing", drawing.study),
     "voting": ("Voting", voting.study),
+    "reconstruction": ("Reconstruction", reconstruction.study),
     "whole": ("The whole pipeline", whole.study),
 }
 OPTIONS = {"scenes": {"nargs": "*", "default": list(SCENES), "choices": SCENES, "help": "that are simulated"}}
