@@ -26,6 +26,7 @@ _AGREES = np.radians(5.0)  # tilt up to which the ground refines what the camera
 _GROUND = 0.08  # least share of the core's points on it where cameras tell which way is up, ...
 _GROUND_ALONE = 0.2  # and where nothing does
 _BELOW = 0.2  # most of the core's points below it: a table top has a floor, a roof has a house
+_WIDER = 1.3  # times the area of what is above it that a ground has
 _FOOT = 0.02  # share of the core's points below its foot, where there is no plane
 
 
@@ -49,7 +50,8 @@ def find_up(
     upward axes tell its sense. The ground is the plane with the most points that is level to within 25 degrees and has
     at most a fifth of the points below it (RANSAC, Fischler & Bolles 1981, then least squares); where it is within 5
     degrees of what the cameras say, its normal is taken; else it is a slope. Without cameras the largest plane is taken
-    that has four fifths of the points on one side.
+    that has four fifths of the points on one side; it is the ground where it spreads wider than what is above it, and
+    else, as soil in a pot, tells which way is up alone.
 
     `find_up(views.cameras, load_points(views.points_path)[0]).up`
 
@@ -81,12 +83,33 @@ def find_up(
         raise InputError(
             "up: there are no cameras, and no plane among the points to be the ground; give up as three numbers."
         )
+    if plane is not None and prior is None and not _carries(core, *plane):
+        plane, share = (
+            None,
+            0.0,
+        )  # a flat layer, as soil in a pot: it tells which way is up, and not where the ground is
     if plane is None:
         lift = float(np.quantile(np.dot(core, up), _FOOT) - np.dot(extent.centre, up))
     else:
         lift = -float(np.dot(extent.centre - place, normal) / np.dot(up, normal))
     foot = extent.centre + lift * up
     return Upright(up, foot, by, roll, share)
+
+
+def spreads_wider(layer: Float[np.ndarray, "n 2"], above: Float[np.ndarray, "m 2"]) -> bool:
+    """Whether a layer covers more than what lies above it, seen from above: a ground, not a flat part of an object."""
+    areas = [float(np.prod(np.subtract(*np.quantile(part, [0.95, 0.05], axis=0)))) for part in (layer, above)]
+    return areas[0] > _WIDER * areas[1]
+
+
+def _carries(
+    core: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "3"], place: Float[np.ndarray, "3"],
+    on: Bool[np.ndarray, "n"],
+) -> bool:  # fmt: skip
+    """Whether a plane spreads wider than the points above it, of which there may be none."""
+    above = (np.dot(core - place, normal) > 0) & ~on
+    across = np.linalg.svd(normal[None])[2][1:].T
+    return not above.any() or spreads_wider(np.dot(core[on], across), np.dot(core[above], across))
 
 
 def up_of_cameras(cameras: Camera) -> tuple[Float[np.ndarray, "3"], float]:

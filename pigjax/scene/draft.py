@@ -21,7 +21,7 @@ from pigjax import io
 from pigjax.core.camera import Camera, orbit
 from pigjax.core.errors import InputError
 from pigjax.core.placing import placed, up_to
-from pigjax.core.upright import find_up
+from pigjax.core.upright import find_up, spreads_wider
 from pigjax.coupling.solid import large_parts, parts_of
 from pigjax.mpm.materials import PRESETS
 from pigjax.objects.lifting import lift
@@ -34,7 +34,6 @@ _Z = np.array([0.0, 0.0, 1.0])
 THUMBNAIL = 192  # px
 _BINS = 60  # of the heights in which a ground is looked for
 _LEAST_GROUND = 0.12  # share of the splats in a layer that counts as a ground
-_WIDER = 1.3  # times the area of what is above it that a ground has
 _FEWEST = 50  # Gaussians of a part that is offered as an object
 _MOST_PARTS = 16
 _SUPPORTS = ("table", "desk", "floor", "ground", "shelf", "plinth", "pot", "wall", "bench", "board")
@@ -191,8 +190,7 @@ def ground_height(means: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, "3"])
         return None
     across = means[:, np.abs(axis) < 0.5]
     layer, above = ((heights <= top) & (heights >= height - (top - height)), heights > top)
-    areas = [float(np.prod(np.subtract(*np.quantile(across[k], [0.95, 0.05], axis=0)))) for k in (layer, above)]
-    return height if areas[0] > _WIDER * areas[1] else None
+    return height if spreads_wider(across[layer], across[above]) else None
 
 
 def thumbnails(draft: Draft) -> dict[str, Float[np.ndarray, "h w 3"]]:

@@ -119,3 +119,15 @@ def test_a_ball_of_points_has_no_ground_and_stands_on_its_foot():
     assert find_up(around(), None).by == "cameras"
     with pytest.raises(InputError, match="neither cameras nor points"):
         find_up(None, None)
+
+
+def test_soil_in_a_pot_tells_up_and_is_not_the_ground():
+    """Leaves spread wider than the soil below them, and the pot reaches a quarter of a metre farther down."""
+    rng = np.random.default_rng(4)
+    soil = np.concatenate([rng.uniform(-0.1, 0.1, (3000, 2)), rng.normal(0, 1e-3, (3000, 1))], 1)
+    pot = np.concatenate([rng.uniform(-0.08, 0.08, (1200, 2)), rng.uniform(-0.25, 0, (1200, 1))], 1)
+    leaves = rng.uniform([-0.3, -0.3, 0.1], [0.3, 0.3, 0.7], (3000, 3))
+    found = find_up(None, np.concatenate([soil, pot, leaves]))
+    assert found.up @ [0, 0, 1] > 0.999
+    assert found.share == 0
+    assert -0.25 <= found.foot[2] < -0.2
