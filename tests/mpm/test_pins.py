@@ -1,9 +1,11 @@
 """Pinned regions: a hanging bar by d'Alembert's solution, nothing moves in them, gradients pass beside them."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import curve_fit
 
 from pigjax.core.regions import BoxRegion, HalfSpace
 from pigjax.mls_mpm import SimConfig, rollout, step
@@ -69,3 +71,27 @@ def test_gradients_pass_beside_a_pin():
     numeric = (drop(G + 20.0) - drop(G - 20.0)) / 40.0
     assert float(slope) == pytest.approx(float(numeric), rel=2e-2)
     assert float(slope) < 0
+
+
+def test_a_pinned_bar_swings_in_its_first_mode_with_the_period_4L_over_c():
+    """u = V/ω sin(ωt) sin(πs/2L) with s from the pin and ω = πc/2L; a bar without pin would drift off instead."""
+    particles, c, speed = bar(), np.sqrt(YOUNG / DENSITY), 0.05
+    omega, depth = np.pi * c / (2 * LENGTH), LENGTH - np.asarray(particles.x[:, 2])
+    shape = np.sin(np.clip(depth, 0, None) * np.pi / (2 * LENGTH))
+    v = -speed * shape[:, None] * np.array([0.0, 0.0, 1.0])
+    swung = eqx.tree_at(lambda p: p.v, particles, jnp.asarray(v, particles.v.dtype))
+    frames, duration = 24, 1.2 * 2 * np.pi / omega
+    path = fall(swung, duration, frames=frames, gravity=0.0)[1]
+    moved = np.asarray(particles.x[:, 2] - path.x[:, :, 2])  # downward
+    amplitude = moved @ shape / (shape @ shape)
+    t = duration * np.arange(1, frames + 1) / frames
+
+    def swing(t, height, rate, loss):
+        return height * np.exp(-loss * t) * np.sin(rate * t)
+
+    (height, rate, loss), _ = curve_fit(swing, t, amplitude, (speed / omega, omega, 0.0))
+    print(f"first mode: ω {rate / omega - 1:+.2%}, amplitude {height * omega / speed - 1:+.2%}, damping {loss:.3f}/s")
+    assert rate == pytest.approx(omega, rel=0.02)  # the pin's kernel holds a part of a cell of 16 below it
+    assert height == pytest.approx(speed / omega, rel=0.02)
+    other = moved - amplitude[:, None] * shape
+    assert np.abs(other[:, depth > 0]).max() < 0.15 * np.abs(amplitude).max()
