@@ -2,7 +2,8 @@
 
     python -m benchmarks real captures motion --data FOLDER --out RESULTS --write
 
-`motion` runs the scene of examples/captures for each capture that `captures` left in `--out`.
+`motion` runs the scene of examples/captures for each capture that the other parts left in `--out`, with the newest
+Gaussians.
 """
 
 import dataclasses
@@ -77,12 +78,22 @@ def captures(options) -> None:
     _print(options, ["none"])
 
 
+def long(options) -> None:
+    """The same with 12,000 steps."""
+    _print(options, ["none"], steps=12_000)
+
+
+def dense(options) -> None:
+    """The same with 120,000 splats and 5,000 steps."""
+    _print(options, ["none"], steps=5_000, splats=120_000)
+
+
 def switches(options) -> None:
     """The same with one setting changed at a time."""
     _print(options, options.switch or list(SWITCHES))
 
 
-def _print(options, changed: list[str]) -> None:
+def _print(options, changed: list[str], steps: int | None = None, splats: int | None = None) -> None:
     if options.data is None:
         print("skipped: --data names no folder of captures")
         return
@@ -91,15 +102,22 @@ def _print(options, changed: list[str]) -> None:
     print(head(*COLUMNS), flush=True)
     for name in names:
         for switch in changed:
-            print(_row(options, name, switch), flush=True)
+            given = (options.size, steps or options.steps, splats or options.splats or "", switch)
+            print(_row(options, name, given), flush=True)
     print(f"\n{_LEGEND}")
 
 
-def _row(options, name: str, switch: str) -> str:
-    """Line of the table: of an earlier run with the same photos and options, or of a process of its own."""
+def _row(options, name: str, given: tuple) -> str:
+    """Line of the table: of an earlier run with the same photos and options, or of a process of its own.
+
+    Args:
+        options: of the command line.
+        name: of the capture.
+        given: size of the photos, steps, splats or "", and the name of a setting.
+    """
     folder = (options.data / name).resolve()
-    out = "" if options.out is None else (options.out / f"{name}-{switch}.ply").resolve()
-    given = [options.size, options.steps, options.splats or "", switch]
+    told = "-".join(str(value) for value in (name, *given) if value != "")
+    out = "" if options.out is None else (options.out / f"{told}.ply").resolve()
     asked, kept = [_fingerprint(folder), *map(str, given)], out and out.with_suffix(".json")
     if kept and kept.is_file() and out.is_file():
         earlier = json.loads(kept.read_text())
@@ -108,7 +126,7 @@ def _row(options, name: str, switch: str) -> str:
     said, _ = start_worker("real", folder, *given, out).communicate()
     lines = said.strip().splitlines()
     if not lines or not lines[-1].startswith("|"):
-        return row(name, switch, "failed", *[""] * (len(COLUMNS) - 3))
+        return row(name, given[-1], "failed", *[""] * (len(COLUMNS) - 3))
     if kept:
         kept.write_text(json.dumps({"asked": asked, "row": lines[-1]}))
     return lines[-1]
@@ -136,7 +154,9 @@ def motion(options) -> str:
     print(head("capture", "shows", "splats of the objects", "particles", "frames", "s", "GB", "least J", "notes"))
     pictures = []
     for scene in sorted((EXAMPLES / "captures").glob("*.toml")):
-        name, made = scene.stem, (options.out / f"{scene.stem}-none.ply").resolve()
+        name = scene.stem
+        found = list(options.out.glob(f"{name}-{options.size}-*-none.ply"))
+        made = max(found, key=lambda path: path.stat().st_mtime, default=options.out / f"{name}.ply").resolve()
         if options.sets and name not in options.sets:
             continue
         if not made.is_file():
@@ -241,7 +261,13 @@ def _mask_iou(gaussians, views: Views, drawing: RenderConfig) -> str:
     return f"{np.mean(scores):.3f}"
 
 
-PARTS = {"captures": ("Captures", captures), "motion": ("Motion", motion), "switches": ("Settings", switches)}
+PARTS = {
+    "captures": ("Captures", captures),
+    "long": ("More steps", long),
+    "dense": ("More splats", dense),
+    "switches": ("Settings", switches),
+    "motion": ("Motion", motion),
+}
 OPTIONS = {
     "data": {"type": Path, "help": "folder with a folder for each capture"},
     "sets": {"nargs": "*", "help": "names of captures; all without"},

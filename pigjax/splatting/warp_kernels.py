@@ -126,10 +126,23 @@ def _tools(wp: Any, single: bool) -> Any:
         fall = real(0.5) * (first[2] * u * u + second[0] * v * v) + first[3] * u * v
         return wp.exp(second[1] - fall)
 
+    @wp.func
+    def add_shape(
+        sums: wp.array3d(dtype=vec4), row: wp.int64, first: vec4, second: vec4, u: real, v: real, slope: real,
+        depth: real, whole: int,
+    ):  # fmt: skip
+        """Cotangents of a splat's centre, inverse covariance, log opacity and depth; `slope` is that of log alpha."""
+        half = real(0.5) * slope
+        of_centre = vec4(
+            slope * (first[2] * u + first[3] * v), slope * (second[0] * v + first[3] * u), -half * u * u, -slope * u * v
+        )
+        add(sums, row, of_centre, 4, whole)
+        add(sums, row + wp.int64(1), vec4(-half * v * v, slope, depth, real(0.0)), 3, whole)
+
     # unrolled loops take long to compile; a CPU gains little from them
     unrolled = {"max_unroll": 1 if jax.default_backend() == "cpu" else 16}
     kernel = functools.partial(wp.kernel, module="unique", enable_backward=False, module_options=unrolled)
-    return kernel, real, vec4, any_of_warp, add, read, row_of, pixel_centre, opacity
+    return kernel, real, vec4, any_of_warp, add, add_shape, read, row_of, pixel_centre, opacity
 
 
 @functools.cache
@@ -142,7 +155,7 @@ def blend_kernels(channels: int, single: bool) -> BlendKernels:
         single: float32, else float64.
     """
     wp = import_warp()
-    kernel, real, vec4, any_of_warp, add, read, row_of, pixel_centre, opacity = _tools(wp, single)
+    kernel, real, vec4, any_of_warp, add, add_shape, read, row_of, pixel_centre, opacity = _tools(wp, single)
     sums_of = wp.types.matrix(shape=(channels, 4), dtype=real)
 
     @kernel
@@ -223,12 +236,7 @@ def blend_kernels(channels: int, single: bool) -> BlendKernels:
                         slope = weight * gain - (sum_ - passed) * (alpha / (real(1.0) - alpha))
                 through = after
             if any_of_warp(seen, whole) == 1:
-                a, half, c = first[2], real(0.5) * slope, second[0]
-                by_place = vec4(
-                    slope * (a * u + first[3] * v), slope * (c * v + first[3] * u), -half * u * u, -slope * u * v
-                )
-                add(of_rows, row, by_place, 4, whole)
-                add(of_rows, row + wp.int64(1), vec4(-half * v * v, slope, pick, real(0.0)), 3, whole)
+                add_shape(of_rows, row, first, second, u, v, slope, pick, whole)
                 for q in range(wp.static(channels)):
                     add(of_rows, row + wp.int64(wp.static(QUADS) + q), weight * cotangent[q], 4, whole)
         transmittance[b, tile, pixel] = through
@@ -251,7 +259,7 @@ def surface_kernels(single: bool) -> SurfaceKernels:
     transmittance falls by T / (1 - alpha) with the alpha of every splat in front of it.
     """
     wp = import_warp()
-    kernel, real, vec4, any_of_warp, add, read, row_of, pixel_centre, opacity = _tools(wp, single)
+    kernel, real, vec4, any_of_warp, _, add_shape, read, row_of, pixel_centre, opacity = _tools(wp, single)
 
     @wp.func
     def passed(through: real, limits: vec4, width: real):
@@ -333,12 +341,7 @@ def surface_kernels(single: bool) -> SurfaceKernels:
                 share = given * (behind - front)
                 through = after
             if any_of_warp(seen, whole) == 1:
-                a, half, c = first[2], real(0.5) * slope, second[0]
-                by_place = vec4(
-                    slope * (a * u + first[3] * v), slope * (c * v + first[3] * u), -half * u * u, -slope * u * v
-                )
-                add(of_rows, row, by_place, 4, whole)
-                add(of_rows, row + wp.int64(1), vec4(-half * v * v, slope, share, real(0.0)), 3, whole)
+                add_shape(of_rows, row, first, second, u, v, slope, share, whole)
         transmittance[b, tile, pixel] = through
         prefix[b, tile, pixel] = done
 
@@ -354,7 +357,7 @@ def surface_kernels(single: bool) -> SurfaceKernels:
 def list_kernels(single: bool) -> ListKernels:
     """Kernels that write the slots of lists and sum credits, in single or double precision."""
     wp = import_warp()
-    kernel, real, vec4, _, _, read, row_of, pixel_centre, opacity = _tools(wp, single)
+    kernel, real, vec4, _, _, _, read, row_of, pixel_centre, opacity = _tools(wp, single)
     pair, most = wp.vec2i, _SORTED_AT_ONCE
 
     @wp.func
