@@ -21,8 +21,8 @@ from matplotlib.figure import Figure
 
 from benchmarks.common.pages import head, picture, row
 from benchmarks.common.timing import in_turn, measure, peak_memory
-from pigjax import Gaussians, RenderConfig, look_at, render, stack_cameras
-from pigjax.splatting.binning import bin_splats, blend_config, list_pass, shards_of
+from pigjax import Gaussians, RenderConfig, look_at, render, render_over, stack_cameras
+from pigjax.splatting.binning import bin_splats, blend_config, list_pass, shards_of, touched_tiles
 from pigjax.splatting.compositor import composite
 from pigjax.splatting.projection import project_splats
 from pigjax.splatting.sh import colours
@@ -200,10 +200,44 @@ def plot(series, path):
     figure.savefig(path)
 
 
+def _rgb(gaussians, camera, config):
+    return render(gaussians, camera, config, outputs=("rgb",)).rgb
+
+
+def over(options):
+    """A picture of which a share moves, over a still one, beside the whole picture."""
+    print(
+        "The splats in one half of the image, or a quarter of its height, move; the time is beside the whole picture.\n"
+    )
+    print(head("splats", "pixels", "tiles redrawn %", "whole ms", "over ms", "share", "largest difference"))
+    for text in options.rows:
+        count, width, height = size_of(text)
+        gaussians, camera = ball(count, width, height)
+        config = RenderConfig(bands=jax.local_device_count())
+        blending = blend_config(camera, config, count, surface=False)
+        projected = project_splats(as_splats(gaussians), camera, config)
+        for below in (0.5, 0.75, 0.9):
+            moving = projected.centres[:, 1] > below * height
+            hidden = replace(gaussians, logit_opacities=jnp.where(moving, -40.0, gaussians.logit_opacities))
+            still = render(hidden, camera, config).rgb
+            redrawn = 100 * float(touched_tiles(projected, moving, blending).mean())
+            runs = {
+                "whole": partial(_rgb, gaussians, camera, config),
+                "over": partial(render_over, still, gaussians, moving, camera, config),
+            }
+            timed = in_turn(runs)
+            whole, ours = timed["whole"], timed["over"]
+            worst = float(jnp.abs(whole.result - ours.result).max())
+            milliseconds = f"{1e3 * whole.seconds:.1f}", f"{1e3 * ours.seconds:.1f}"
+            share = f"{ours.seconds / whole.seconds:.2f}"
+            print(row(count, f"{width}x{height}", f"{redrawn:.0f}", *milliseconds, share, f"{worst:.1g}"), flush=True)
+
+
 PARTS = {
     "sizes": ("Drawing by size", sizes),
     "stages": ("Drawing by stage", stages),
     "settings": ("Drawing by setting", settings),
+    "over": ("Over a still picture", over),
     "growth": ("Growth of the time of drawing", growth),
 }
 OPTIONS = {

@@ -60,6 +60,7 @@ from pigjax.splat import (
     RenderConfig,
     Splats,
     render,
+    render_over,
     required_capacity,
     surface_depth,
 )
@@ -176,6 +177,7 @@ __all__ = [
     "refit_boundaries",
     "remove_object",
     "render",
+    "render_over",
     "required_capacity",
     "rollout",
     "run_scene",

@@ -22,21 +22,39 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.arguments import checked
 from pigjax.core.arrays import in_precision
 from pigjax.core.camera import Camera, require_one, stack_cameras
 from pigjax.core.errors import InputError
 from pigjax.core.linalg import safe_normalize
-from pigjax.splatting.binning import bin_splats, blend_config, count_pairs, shards_of, tile_boxes
+from pigjax.splatting.binning import (
+    bin_splats,
+    blend_config,
+    count_pairs,
+    pixels_of,
+    shards_of,
+    tile_boxes,
+    touched_tiles,
+    within_tiles,
+)
 from pigjax.splatting.compositor import Blended, composite
 from pigjax.splatting.projection import normals, project_splats
 from pigjax.splatting.sh import colours
 from pigjax.splatting.sharding import all_gather, shard_splats
 from pigjax.splatting.types import OUTPUTS, Frame, Gaussians, Projected, RenderConfig, Splats, as_splats
 
-__all__ = ["Frame", "Gaussians", "RenderConfig", "Splats", "render", "required_capacity", "surface_depth"]
+__all__ = [
+    "Frame",
+    "Gaussians",
+    "RenderConfig",
+    "Splats",
+    "render",
+    "render_over",
+    "required_capacity",
+    "surface_depth",
+]
 
 Channels = dict[str, Float[Array, "n _"]]  # channels of each splat by output, in the order of the table's columns
 
@@ -86,7 +104,50 @@ def render(
     dtype = gaussians_or_splats.means.dtype
     tau_T, background = jnp.asarray(tau_T, dtype), jnp.asarray(background, dtype)
     camera, given = in_precision((camera, given), dtype)
-    return _render(gaussians_or_splats, camera, config, background, tuple(outputs), given, tau_T)
+    return _render(gaussians_or_splats, camera, config, background, tuple(outputs), given, tau_T)[0]
+
+
+@checked
+def render_over(
+    still: Float[Array, "h w 3"],
+    splats: Gaussians | Splats,
+    moving: Bool[Array, "n"],
+    camera: Camera,
+    config: RenderConfig = RenderConfig(),
+    *,
+    background: Float[Array, "*c"] | float = 0.0,
+    everywhere: Bool[Array, ""] | bool = False,
+) -> Float[Array, "h w 3"]:
+    """The picture of `render` where some splats moved and the camera did not: other tiles are those of a still picture.
+
+    A tile that no moving splat may touch shows the others alone, as `still` does: its pixels are taken from there, and
+    only splats that reach into another tile are listed. `still` is the picture of the splats that do not move.
+
+        still = render(hidden, camera, background=1.0).rgb  # the moving ones with a logit of opacity of -40
+        rgb = render_over(still, posed, moving, camera, background=1.0)
+
+    Args:
+        still: picture of the splats that do not move, from the same camera, over the same background.
+        splats: all of them, in the world [m].
+        moving: which of them may differ from those of `still`.
+        camera: a single camera.
+        config: thresholds and capacities.
+        background: colour behind the splats, as of `render`.
+        everywhere: draw all tiles, which gives `render`'s picture without a second program; False by default.
+
+    Returns:
+        RGB, equal to that of `render`.
+
+    Raises:
+        InputError: a batch of cameras.
+    """
+    require_one(camera, "camera")
+    dtype = splats.means.dtype
+    camera, still = in_precision((camera, still), dtype)
+    tau_T, over = jnp.asarray(0.5, dtype), jnp.asarray(background, dtype)
+    frame, changed = _render(splats, camera, config, over, ("rgb",), {}, tau_T, (moving, jnp.asarray(everywhere)))
+    assert frame.rgb is not None
+    return jnp.where(changed[..., None], frame.rgb, still)
 
 
 @eqx.filter_jit
@@ -98,12 +159,15 @@ def _render(
     outputs: tuple[str, ...],
     given: Any,
     tau_T: Float[Array, ""],
-) -> Frame:
+    changed: tuple[Bool[Array, "n"], Bool[Array, ""]] | None = None,
+) -> tuple[Frame, Any]:
+    """The outputs, and the pixels of tiles that a change may touch: of some splats, or of all if the flag is set."""
     shards = shards_of(camera, config)
     splats = as_splats(shard_splats(gaussians_or_splats, shards))
     if len(splats) == 0:
         # gathers need a row: one splat of opacity 0 draws nothing
         splats, given = jax.tree.map(lambda v: jnp.zeros((1, *v.shape[1:]), v.dtype), (splats, given))
+        changed = None if changed is None else (jnp.zeros(1, bool), changed[1])
     blending = blend_config(camera, config, len(splats), surface="surface_depth" in outputs)
 
     with jax.named_scope("project"):
@@ -112,11 +176,14 @@ def _render(
         channels = shade_splats(splats, projected, camera, config, outputs) | given
     projected, table = all_gather((projected, _columns(channels, projected)), shards)
     with jax.named_scope("bin"):
-        boxes = bin_splats(projected, blending)
+        boxes, pixels = bin_splats(projected, blending), None
+        if changed is not None:
+            tiles = touched_tiles(projected, changed[0], blending) | changed[1]
+            boxes, pixels = within_tiles(boxes, tiles, blending), pixels_of(tiles, blending)
     with jax.named_scope("composite"):
         reverse = config.differentiation == "reverse"
         blended = composite(projected, table, boxes, blending, tau_T, reverse=reverse)
-    return _frame(blended, channels, outputs, background)
+    return _frame(blended, channels, outputs, background), pixels
 
 
 def shade_splats(

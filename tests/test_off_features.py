@@ -284,7 +284,7 @@ def test_a_picture_without_a_light_traces_no_shadows(monkeypatch):
     camera = look_at(np.array([1.0, 0, 0.3]), np.array([0.0, 0, 0.3]), focal=20.0, width=16, height=16)
 
     def drawn(gaussians, splats, shade):
-        return shaded_picture(gaussians, splats, camera, shade, RenderConfig(), jnp.ones(3))
+        return shaded_picture(gaussians, splats, camera, shade, None, RenderConfig(), jnp.ones(3))
 
     shade = jnp.ones(20, bool), Light(direction=(0.0, 0.0, -1.0)), jnp.ones(20), jnp.ones(20)
     on = primitives(jax.make_jaxpr(drawn)(gaussians, splats, shade))

@@ -8,7 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from pigjax.clamp import ClampParams, clamped_shapes, held_deformation
@@ -192,6 +192,21 @@ def _own_pose(
     means = particles.x[own.rows][own.at] + einsum("mij,mj->mi", here, own.offsets)
     factors = einsum("mij,mjk->mik", here, gaussian_factors(mine)) * shrunk[:, None, None]
     return own.gaussian, means, factors, None if turned is None else rotation[own.at]
+
+
+@checked
+def carried_gaussians(gaussians: Gaussians, particles: Particles, binding: Binding | None) -> Bool[Array, "n"]:
+    """Which Gaussians `deform` moves: those of particles and those of the binding.
+
+    Args:
+        gaussians: of the scene.
+        particles: which name their Gaussians.
+        binding: of `bind`, or None.
+    """
+    index = [jnp.where(particles.gaussian >= 0, particles.gaussian, len(gaussians))]
+    if binding is not None:
+        index += [binding.gaussian] if binding.own is None else [binding.gaussian, binding.own.gaussian]
+    return jnp.zeros(len(gaussians), bool).at[jnp.concatenate(index)].set(True, mode="drop")
 
 
 @checked

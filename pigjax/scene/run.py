@@ -22,7 +22,7 @@ from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError, SimulationError, StaleError
 from pigjax.core.linalg import safe_norm
-from pigjax.coupling.binding import deform
+from pigjax.coupling.binding import carried_gaussians, deform
 from pigjax.mpm import Particles
 from pigjax.mpm.active_grid import ActiveGrid
 from pigjax.mpm.simulate import SimulatedFrame
@@ -44,10 +44,11 @@ from pigjax.scene.schema import Scene, values_of
 from pigjax.scene.stages import Stage, simulate_stages, stages_of
 from pigjax.scene.world import described
 from pigjax.segmentation import Labels, pixel_ids
-from pigjax.splat import Gaussians, RenderConfig, Splats, render
+from pigjax.splat import Gaussians, RenderConfig, Splats, render, render_over
 from pigjax.splatting.shadows import Light, cast_shadows, light_transmittance
 
 _SHEET_FRAMES = 12
+_UNSEEN = -40.0  # logit of an opacity that is never drawn
 _FILES = (
     "video.mp4", "contact_sheet.png", "objects.png", "labels.npz", COLLIDER_FILE, REST_FILE, SCENE_FILE, "report.json",
     "report.html",
@@ -408,6 +409,7 @@ def shaded_picture(
     splats: Splats,
     camera: Camera,
     shade: tuple[jax.Array, Light, jax.Array, jax.Array] | None,
+    still: tuple[jax.Array, jax.Array, jax.Array] | None,
     config: RenderConfig,
     background: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
@@ -418,14 +420,21 @@ def shaded_picture(
         splats: posed.
         camera: of the frame.
         shade: arguments of `cast_shadows` after the splats; None: no light, and nothing of it is traced.
+        still: picture of the splats that never move, which splats move, and whether all tiles are drawn, of
+            `render_over`; None: the camera moves or a light shines, and the whole picture is drawn.
         config: of the renderer.
         background: colour behind the splats.
     """
     if shade is not None:
         splats = cast_shadows(splats, *shade)
-    frame = render(splats, camera, config, background=background, outputs=("rgb",))
+    if still is None:
+        rgb = render(splats, camera, config, background=background, outputs=("rgb",)).rgb
+        assert rgb is not None
+    else:
+        picture, moving, everywhere = still
+        rgb = render_over(picture, splats, moving, camera, config, background=background, everywhere=everywhere)
     longest = safe_norm(splats.factors, axis=1) / jnp.exp(gaussians.log_scales)  # of each axis
-    return jnp.clip(frame.rgb, 0, 1), longest.max(1)
+    return jnp.clip(rgb, 0, 1), longest.max(1)
 
 
 def _moving(scene: Scene, inputs: Inputs, labels: Labels) -> np.ndarray:
@@ -437,9 +446,10 @@ class _Pictures(NamedTuple):
     """The cameras of all frames, and the program that poses and renders one, compiled beside the simulation."""
 
     cameras: Camera
-    program: Future[Any]  # (gaussians, particles, binding, camera, shade): picture, largest stretch of each splat
+    program: Future[Any]  # (gaussians, particles, binding, camera, shade, still): picture, stretch of each splat
     lit: Callable[..., jax.Array] | None  # (gaussians, particles, binding, casts, light): transmittance
     shade: tuple[jax.Array, Light, jax.Array, jax.Array] | None  # of `shaded_picture`, at rest
+    still: tuple[jax.Array, jax.Array, jax.Array] | None  # of `shaded_picture`, before the still picture is drawn
 
     @classmethod
     def of(cls, scene: Scene, inputs: Inputs, plan: Plan) -> _Pictures:
@@ -457,17 +467,25 @@ class _Pictures(NamedTuple):
                 splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
                 return light_transmittance(splats, *lights)
 
+        still = None
+        if scene.light is None and all(bool((leaf == leaf[:1]).all()) for leaf in jax.tree.leaves(cameras)):
+            nothing = jnp.zeros((cameras.height, cameras.width, 3), inputs.gaussians.means.dtype)
+            moving = carried_gaussians(inputs.gaussians, plan.particles, plan.binding)
+            still = nothing, moving, jnp.asarray(True)
+
         # everything large comes in as an argument: XLA would fold constants for minutes
         @jax.jit
-        def pose_and_render(gaussians: Gaussians, particles: Particles, binding: Any, camera: Camera, shade: Any):
+        def pose_and_render(
+            gaussians: Gaussians, particles: Particles, binding: Any, camera: Camera, shade: Any, still: Any
+        ):  # fmt: skip
             splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
-            return shaded_picture(gaussians, splats, camera, shade, config, background)
+            return shaded_picture(gaussians, splats, camera, shade, still, config, background)
 
-        traced = pose_and_render.lower(inputs.gaussians, plan.particles, plan.binding, cameras[0], shade)
+        traced = pose_and_render.lower(inputs.gaussians, plan.particles, plan.binding, cameras[0], shade, still)
         compiler = ThreadPoolExecutor(1)
         program = compiler.submit(traced.compile)
         compiler.shutdown(wait=False)
-        return cls(cameras, program, lit, shade)
+        return cls(cameras, program, lit, shade, still)
 
 
 def _draw(
@@ -485,11 +503,11 @@ def _draw(
 ) -> None:
     """Pose and render each saved state, once `states` says that it is there; remove it where it is not to be kept."""
     frames, gaussians = scene.simulation.frames, inputs.gaussians
-    cameras, at_rest = drawn.cameras, None
+    cameras, at_rest, still = drawn.cameras, None, drawn.still
     moving = _moving(scene, inputs, labels)
 
     def draw(frame: int) -> tuple[jax.Array, jax.Array]:
-        nonlocal at_rest
+        nonlocal at_rest, still
         state = io.load_state(out / "states", frame, signature=key)
         there = tuple(np.asarray(state[name], plan.particles.x.dtype) for name in ("x", "F_visual"))
         particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, there)
@@ -499,7 +517,12 @@ def _draw(
             reached = drawn.lit(shown, particles, plan.binding, *shade[:2])
             at_rest = reached if at_rest is None else at_rest  # the first frame that is drawn is the rest state
             shade = *shade[:2], reached, at_rest
-        return program()(shown, particles, plan.binding, cameras[frame], shade)
+        if still is not None and bool(still[2]):  # drawn once, by the same program, without what moves
+            hidden = jnp.where(still[1], _UNSEEN, shown.logit_opacities)
+            alone = eqx.tree_at(lambda g: g.logit_opacities, shown, hidden)
+            picture, _ = program()(alone, particles, plan.binding, cameras[frame], shade, still)
+            still = jnp.asarray(np.asarray(picture)), still[1], jnp.asarray(False)  # on one device, as compiled for
+        return program()(shown, particles, plan.binding, cameras[frame], shade, still)
 
     def program() -> Any:
         """The compiled program; time spent waiting for it counts as compiling."""

@@ -149,6 +149,29 @@ def tile_boxes(projected: Projected, config: BlendConfig) -> tuple[Int[Array, "n
     return low, jnp.where(projected.visible[:, None], jnp.maximum(high - low, 0), 0)
 
 
+def touched_tiles(projected: Projected, some: Bool[Array, "n"], config: BlendConfig) -> Bool[Array, "tiles"]:
+    """Tiles in the boxes of some of the splats: corners of the boxes are counted, and summed along both axes."""
+    low, size = tile_boxes(lax.stop_gradient(projected), config)
+    counts = (some & (size > 0).all(1)).astype(jnp.int32)
+    (x0, y0), (x1, y1), wide = low.T, (low + size).T, config.columns + 1
+    corners = jnp.concatenate([y0 * wide + x0, y1 * wide + x1, y0 * wide + x1, y1 * wide + x0])
+    signed = jnp.concatenate([counts, counts, -counts, -counts])
+    table = jnp.zeros((config.rows + 1) * wide, jnp.int32).at[corners].add(signed).reshape(-1, wide)
+    return (table.cumsum(0).cumsum(1)[:-1, :-1] > 0).ravel()
+
+
+def within_tiles(boxes: Boxes, tiles: Bool[Array, "tiles"], config: BlendConfig) -> Boxes:
+    """The same boxes, empty where they hold none of the tiles."""
+    kept = pairs_in_open_tiles(boxes, tiles, config) > 0
+    return Boxes(boxes.order, boxes.low, jnp.where(kept[:, None], boxes.size, 0))
+
+
+def pixels_of(tiles: Bool[Array, "tiles"], config: BlendConfig) -> Bool[Array, "h w"]:
+    """The pixels of tiles."""
+    image = tiles.reshape(config.rows, config.columns).repeat(config.tile, 0).repeat(config.tile, 1)
+    return image[: config.height, : config.width]
+
+
 def rows_in_order(projected: Projected, boxes: Boxes, *features: Float[Array, "n _"]) -> Float[Array, "n f"]:
     """Rows that tiles composite, front to back: shape columns, then features."""
     rows = jnp.concatenate([projected.shapes, *features], 1)

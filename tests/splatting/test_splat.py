@@ -17,10 +17,20 @@ from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError
 from pigjax.core.harmonics import sh_basis
 from pigjax.core.linalg import quat_to_matrix
-from pigjax.splat import Gaussians, RenderConfig, Splats, render, required_capacity, surface_depth
+from pigjax.splat import Gaussians, RenderConfig, Splats, render, render_over, required_capacity, surface_depth
 from pigjax.splatting import reference
 from pigjax.splatting.alpha import blend_chunk, running_sums, transmittances
-from pigjax.splatting.binning import Boxes, bin_splats, blend_config, count_pairs, list_pass, pairs_in_open_tiles
+from pigjax.splatting.binning import (
+    Boxes,
+    bin_splats,
+    blend_config,
+    count_pairs,
+    list_pass,
+    pairs_in_open_tiles,
+    pixels_of,
+    tile_boxes,
+    touched_tiles,
+)
 from pigjax.splatting.projection import project_splats
 from pigjax.splatting.types import OUTPUTS, as_splats
 
@@ -632,3 +642,44 @@ def test_pictures_and_gradients_are_those_of_the_form_for_accelerators(x64, monk
     monkeypatch.setattr(splat_module, "blend_config", lambda *args, **other: replace(plain(*args, **other), **ours))
     for a, b in zip(jax.tree.leaves(on_cpu), jax.tree.leaves(both()), strict=True):
         np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-10 * float(jnp.abs(a).max()))
+
+
+@pytest.mark.parametrize("bands", [1, 2])
+def test_a_picture_over_a_still_one_is_that_of_all_splats(bands, two_devices):
+    """Bit by bit: tiles that no moving splat may touch hold the same splats in the same order."""
+    scene, camera = make_scene(degree=1, seed=3)
+    everything = gaussians_of(scene)
+    moving = jnp.arange(len(everything)) % 20 == 0
+    config, over = RenderConfig(bands=bands, tile_size=8), {"background": jnp.asarray([0.2, 0.4, 0.9])}
+    hidden = replace(everything, logit_opacities=jnp.where(moving, -40.0, everything.logit_opacities))
+    still = render(hidden, camera, config, **over).rgb
+    blank = jnp.full_like(still, jnp.nan)
+    everywhere = render_over(blank, hidden, moving, camera, config, everywhere=True, **over)
+    np.testing.assert_array_equal(everywhere, still)
+    for shift in (0.0, 0.3, -0.5, 50.0):
+        means = everything.means + shift * moving[:, None] * jnp.asarray([1.0, 0.5, 0.2])
+        posed = replace(everything, means=means)
+        picture = render(posed, camera, config, **over).rgb
+        np.testing.assert_array_equal(render_over(still, posed, moving, camera, config, **over), picture)
+        taken = np.isnan(render_over(blank, posed, moving, camera, config, **over)).any(-1)
+        assert taken.any()
+        assert taken.all() == (shift == 50.0)  # the moving splats are out of sight: nothing is drawn anew
+
+
+def test_tiles_that_boxes_touch_are_those_of_a_loop():
+    scene, camera = make_scene(degree=0, seed=5)
+    splats, config = as_splats(gaussians_of(scene)), replace(DEFAULT, tile_size=8)
+    blending = blend_config(camera, config, len(splats), surface=False)
+    projected = project_splats(splats, camera, config)
+    some = np.arange(len(splats)) % 7 == 0
+    low, size = map(np.asarray, tile_boxes(projected, blending))
+    wanted = np.zeros((blending.rows, blending.columns), bool)
+    for k in np.flatnonzero(some):
+        (x, y), (w, h) = low[k], size[k]
+        wanted[y : y + h * (w > 0), x : x + w] = True
+    found = touched_tiles(projected, jnp.asarray(some), blending)
+    np.testing.assert_array_equal(found, wanted.ravel())
+    assert 0 < wanted.mean() < 1
+    pixels = np.asarray(pixels_of(found, blending))
+    assert pixels.shape == (camera.height, camera.width)
+    assert pixels[5, 11] == wanted[0, 1]
