@@ -1,7 +1,8 @@
 """The gallery: a scene of examples/gallery for each capability, with its processor time and memory.
 
 Each scene runs in a process of its own and leaves its results as `pigjax run` does in `--out`/NAME. Scenes on data that
-the repository does not carry look for it in `--data`, and are skipped with a line that says where a user gets it.
+the repository does not carry look for it in `--data`, and are skipped with a line that says where a user gets it. Rows
+of scenes that lie in `--out` already, from the same files and level, are printed again without a new run.
 """
 
 import os
@@ -12,6 +13,7 @@ from pathlib import Path
 import imageio.v3 as iio
 
 from benchmarks.common.command import start_worker
+from benchmarks.common.kept import commit, fingerprint, kept_row
 from benchmarks.common.pages import EXAMPLES, ROOT, head, row
 from benchmarks.common.timing import peak_memory
 from benchmarks.media import write_sheet
@@ -20,7 +22,7 @@ from pigjax.scene import run_scene, scene_from
 
 SCENES = {path.stem: path for path in sorted((EXAMPLES / "gallery").glob("*.toml"))}
 FILES = ("gaussians", "views", "labels", "names")  # entries of a scene's `input`
-HEADER = head("scene", "shows", "processor s", "GB", "particles", "frames", "substeps", "least J", "notes")
+HEADER = head("scene", "shows", "processor s", "GB", "particles", "frames", "substeps", "least J", "code", "notes")
 
 
 def gallery(options) -> None:
@@ -29,12 +31,18 @@ def gallery(options) -> None:
     for name in options.scenes:
         path = SCENES[name]
         if missing := [part for part in parts_of(path) if not located(path, part, options.data).is_file()]:
-            print(row(name, told(path)[0], *[""] * 6, f"skipped: no {missing[0]}; {data_of(path)}"))
+            print(row(name, told(path)[0], *[""] * 7, f"skipped: no {missing[0]}; {data_of(path)}"))
             continue
-        child = start_worker("gallery", name, options.out, options.data or "", options.accuracy)
-        said, _ = child.communicate()
-        lines = said.strip().splitlines()
-        print(lines[-1] if child.returncode == 0 and lines else row(name, told(path)[0], *[""] * 6, "failed"))
+        files = [path, *(located(path, part, options.data) for part in parts_of(path))]
+
+        def make(name=name):
+            child = start_worker("gallery", name, options.out, options.data or "", options.accuracy)
+            said, _ = child.communicate()
+            return (said.strip().splitlines() or [""])[-1] if child.returncode == 0 else ""
+
+        kept = options.out / name / "row.json"
+        line = kept_row(kept, [fingerprint(files, path.parent), options.accuracy], make)
+        print(line or row(name, told(path)[0], *[""] * 7, "failed"), flush=True)
     clips = {name: options.out / name / "video.mp4" for name in SCENES}
     there = {name: iio.imread(clip) for name, clip in clips.items() if clip.is_file()}
     if there:
@@ -56,7 +64,7 @@ def worker(name: str, out: str, data: str, accuracy: str) -> None:
     sizes = [report.sizes[key] for key in ("particles", "frames", "substeps_per_frame")]
     least = f"{report.health['min_J']:.3f}" if "min_J" in report.health else ""
     notes = "; ".join(report.warnings).replace("\n", " ")
-    print(row(name, told(path)[0], f"{seconds:.0f}", f"{peak_memory():.1f}", *sizes, least, notes))
+    print(row(name, told(path)[0], f"{seconds:.0f}", f"{peak_memory():.1f}", *sizes, least, commit(), notes))
 
 
 def parts_of(path: Path) -> list[str]:

@@ -7,9 +7,6 @@ Gaussians.
 """
 
 import dataclasses
-import hashlib
-import json
-import subprocess
 import time
 from pathlib import Path
 
@@ -20,7 +17,8 @@ import numpy as np
 from PIL import Image
 
 from benchmarks.common.command import start_worker
-from benchmarks.common.pages import EXAMPLES, ROOT, head, picture, row
+from benchmarks.common.kept import commit, fingerprint, kept_row
+from benchmarks.common.pages import EXAMPLES, head, picture, row
 from benchmarks.common.timing import clock, peak_memory, use_host_devices
 from benchmarks.gallery import told
 from benchmarks.media import few_colours, tiles
@@ -118,32 +116,17 @@ def _row(options, name: str, given: tuple) -> str:
     folder = (options.data / name).resolve()
     told = "-".join(str(value) for value in (name, *given) if value != "")
     out = "" if options.out is None else (options.out / f"{told}.ply").resolve()
-    asked, kept = [_fingerprint(folder), *map(str, given)], out and out.with_suffix(".json")
-    if kept and kept.is_file() and out.is_file():
-        earlier = json.loads(kept.read_text())
-        if earlier["asked"] == asked:
-            return earlier["row"]
-    said, _ = start_worker("real", folder, *given, out).communicate()
-    lines = said.strip().splitlines()
-    if not lines or not lines[-1].startswith("|"):
-        return row(name, given[-1], "failed", *[""] * (len(COLUMNS) - 3))
-    if kept:
-        kept.write_text(json.dumps({"asked": asked, "row": lines[-1]}))
-    return lines[-1]
+    asked = [fingerprint((path for path in folder.rglob("*") if path.is_file()), folder), *map(str, given)]
 
+    def make():
+        said, _ = start_worker("real", folder, *given, out).communicate()
+        return (said.strip().splitlines() or [""])[-1]
 
-def _fingerprint(folder: Path) -> str:
-    """Hash of all files of a capture, by name and content."""
-    found = hashlib.sha256()
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        found.update(str(path.relative_to(folder)).encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
-    return found.hexdigest()
-
-
-def _commit() -> str:
-    """Short name of the commit, with + where files were changed since."""
-    said = subprocess.run(("git", "describe", "--always", "--dirty=+"), cwd=ROOT, capture_output=True, text=True)
-    return said.stdout.strip()
+    kept = out.with_suffix(".json") if out else None
+    if kept and not out.is_file():
+        kept.unlink(missing_ok=True)
+    line = kept_row(kept, asked, make)
+    return line if line.startswith("|") else row(name, given[-1], "failed", *[""] * (len(COLUMNS) - 3))
 
 
 def motion(options) -> str:
@@ -196,7 +179,7 @@ def worker(task: str, *arguments: str) -> None:
 
 def _reconstruct(folder: str, size: str, steps: str, splats: str, switch: str, out: str) -> None:
     use_host_devices(None)
-    path, commit = Path(folder), _commit()
+    path, code = Path(folder), commit()
     masks = (path / "object_mask").is_dir() or None
     views = load_views(path, masks=masks, missing_masks="abstain", max_size=int(size))
     points = load_points(views.points_path) if views.points_path else None
@@ -212,7 +195,7 @@ def _reconstruct(folder: str, size: str, steps: str, splats: str, switch: str, o
         path.name, switch, len(views), f"{views.cameras.width}x{views.cameras.height}", len(result.gaussians), steps,
         f"{result.mean_psnr:.2f}", least, gained, f"{_training_psnr(result, views.training, config):.2f}",
         f"{result.mean_ssim:.4f}", f"{begun:.0f}", f"{worked:.0f}", f"{peak_memory():.1f}",
-        _mask_iou(result.gaussians, views, config.render), commit,
+        _mask_iou(result.gaussians, views, config.render), code,
     ]  # fmt: skip
     print(row(*cells))
 

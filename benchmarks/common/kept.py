@@ -1,0 +1,43 @@
+"""Rows of long tables, kept beside their results: an interrupted table goes on where it was, with no run made twice."""
+
+import hashlib
+import json
+import subprocess
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from benchmarks.common.pages import ROOT
+
+
+def kept_row(path: Path | None, asked: list[str], make: Callable[[], str]) -> str:
+    """The row of an earlier run that was asked for the same, or a new one, which is kept.
+
+    Args:
+        path: of the JSON that keeps it; None: nothing is kept.
+        asked: all that the row depends on.
+        make: gives a line of a table; anything else, such as "", is no result and is not kept.
+    """
+    if path is not None and path.is_file():
+        earlier = json.loads(path.read_text())
+        if earlier["asked"] == asked:
+            return earlier["row"]
+    line = make()
+    if path is not None and line.startswith("|"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps({"asked": asked, "row": line}))
+    return line
+
+
+def fingerprint(files: Iterable[Path], base: Path) -> str:
+    """Hash of files by name, relative to a folder where they lie in it, and content."""
+    found = hashlib.sha256()
+    for path in sorted(files):
+        name = path.relative_to(base) if path.is_relative_to(base) else path.name
+        found.update(str(name).encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    return found.hexdigest()
+
+
+def commit() -> str:
+    """Short name of the commit, with + where files were changed since."""
+    said = subprocess.run(("git", "describe", "--always", "--dirty=+"), cwd=ROOT, capture_output=True, text=True)
+    return said.stdout.strip()
