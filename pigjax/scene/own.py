@@ -93,6 +93,11 @@ def chosen(scene: Scene, laws: Mapping[str, str], torn: Callable[[str], bool]) -
     ]  # fmt: skip
 
 
+def waits_for_motion(scene: Scene, laws: Mapping[str, str]) -> bool:
+    """Whether the motion decides which objects `chosen` names: "auto" asks whether elastic matter was torn."""
+    return any(scene.objects[name].splats == "auto" and law not in FLOWING for name, law in laws.items())
+
+
 def laws_of(scene: Scene, plan: Plan) -> dict[str, str]:
     """Law of each moving object."""
     return dict(zip([name for name, entry in scene.objects.items() if not entry.fixed], plan.table.laws))

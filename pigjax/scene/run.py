@@ -33,7 +33,7 @@ from pigjax.scene.arrangement import arrange
 from pigjax.scene.budget import ScenePlan, refined
 from pigjax.scene.costs import Comparison, Pace, Prediction, predict
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
-from pigjax.scene.own import MADE, Surfaces, chosen, is_torn, laws_of, surfaces_of, with_own
+from pigjax.scene.own import MADE, Surfaces, chosen, is_torn, laws_of, surfaces_of, waits_for_motion, with_own
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
 from pigjax.scene.replay import COLLIDER_FILE, REST_FILE, SCENE_FILE, rows_of, store_colliders, store_rest
 from pigjax.scene.report import RunReport
@@ -152,22 +152,14 @@ def _run(
     prediction = _predict(scene, inputs, plan, stages, report, planned)
     say(report.plan)
     told = say if planned is not None else None
+    seen, shown, surfaces, laws = inputs, plan, None, laws_of(scene, plan)
     own_wanted = any(entry.splats != "carried" for entry in scene.objects.values())
-    pictures = None if own_wanted else _Pictures.of(scene, inputs, plan)  # of own splats, they are not known yet
-    states = _simulate(scene, plan, stages, out / "states", parts, key, report, tell, told, prediction)
-    followed = None
-    if frames := min(scene.output.error_frames, scene.simulation.frames):
-        followed = Followed(np.asarray(plan.particles.gaussian), frames, out / "states", key)
-        states = followed.along(states)
-    if scene.output.states_every == 1:
-        with report.stage("simulate"):
-            for _ in states:
-                pass
-    seen, shown, surfaces = inputs, plan, None
-    if own_wanted:
+
+    def make_own() -> None:
+        nonlocal seen, shown, surfaces
         with report.stage("splats"):
             tell("splats", 0, 1)
-            names = chosen(scene, laws_of(scene, plan), partial(_was_torn, scene, inputs, rows, out / "states", key))
+            names = chosen(scene, laws, partial(_was_torn, scene, inputs, rows, out / "states", key))
             seen, shown, own = with_own(scene, inputs, plan, names, stored=made, say=say)
             if names:
                 rows["gaussian"] = np.asarray(shown.particles.gaussian)
@@ -177,6 +169,23 @@ def _run(
                     name: int(np.sum(np.asarray(shown.labels.object_id) == inputs.ids[name])) for name in names
                 }
             tell("splats", 1, 1)
+
+    pictures = None  # compiled beside the simulation, where what they show is known before it
+    if not (later := own_wanted and waits_for_motion(scene, laws)):
+        if own_wanted:
+            make_own()
+        pictures = _Pictures.of(scene, seen, shown)
+    states = _simulate(scene, plan, stages, out / "states", parts, key, report, tell, told, prediction)
+    followed = None
+    if frames := min(scene.output.error_frames, scene.simulation.frames):
+        followed = Followed(np.asarray(plan.particles.gaussian), frames, out / "states", key)
+        states = followed.along(states)
+    if scene.output.states_every == 1:
+        with report.stage("simulate"):
+            for _ in states:
+                pass
+    if later:
+        make_own()
     with report.stage("draw"):
         pictures = pictures or _Pictures.of(scene, seen, shown)
         _draw(scene, seen, shown, shown.labels, pictures, out, key, report, tell, states, surfaces)
