@@ -26,7 +26,7 @@ from pigjax.io.files import (
     write_toml,
     writing,
 )
-from pigjax.io.finding import example_folder
+from pigjax.io.finding import example_folder, parts_beside
 from pigjax.io.formats import load_gaussians, origin_of, read_gaussians
 from pigjax.io.gltf import Mesh, save_glb, save_mesh
 from pigjax.io.images import contact_sheet, data_uri, read_image, write_image
@@ -93,6 +93,7 @@ __all__ = [
     "load_views",
     "origin_of",
     "output_folder",
+    "parts_beside",
     "parts_of",
     "plain_label",
     "read_gaussians",

@@ -51,10 +51,21 @@ def find_parts(path: PathLike) -> Found:
         load_cameras(path)
     except InputError as error:
         views, problem = None, str(error)
-    masks = next((folder / name for name in _MASK_FOLDERS if (folder / name).is_dir()), None)
-    names = next((folder / name for name in ("names.json", "labels.json") if (folder / name).is_file()), None)
+    masks, names = parts_beside(path)
     photos = 0 if views is not None else max(_pictures(folder / name) for name in _PHOTO_FOLDERS)
     return Found(_trained(folder), views, masks, names, photos, problem)
+
+
+def parts_beside(views: PathLike) -> tuple[Path | None, Path | None]:
+    """Masks, and the JSON of their names, in the folder of posed photos; None for what is not there. Host.
+
+    Args:
+        views: folder of the photos, or a file in it.
+    """
+    folder = Path(views) if Path(views).is_dir() else Path(views).parent
+    masks = next((folder / name for name in _MASK_FOLDERS if (folder / name).is_dir()), None)
+    names = next((folder / name for name in ("names.json", "labels.json") if (folder / name).is_file()), None)
+    return masks, names
 
 
 def example_folder() -> Path:

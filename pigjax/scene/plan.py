@@ -101,13 +101,18 @@ def read_inputs(scene: Scene) -> Inputs:
         SceneError: an object has no id of its own, or `camera.view` is not the name of a photo.
     """
     spec = scene.input
-    names = {} if spec.names is None else io.load_names(scene.path(spec.names))
+    masked, named = (None, None) if spec.views is None else io.parts_beside(scene.path(spec.views))
+    named = named if spec.names is None else scene.path(spec.names)
+    names = {} if named is None else io.load_names(named)
     known = {name: _id_of(name, scene, names) for name in scene.objects}
     _check_ids({name: number for name, number in known.items() if number is not None})
     gaussians = read_gaussians(scene)
     views = None
     if spec.views is not None:
-        masks = True if spec.masks is None else scene.path(spec.masks)
+        # where every object is chosen without masks, there may be none
+        needed = spec.labels is None and any(e.within is None and e.gaussians is None for e in scene.objects.values())
+        there = masked is not None and masked.name == "object_mask"
+        masks = scene.path(spec.masks) if spec.masks is not None else True if needed or there else None
         photos = None if spec.images is None else scene.path(spec.images)
         views = io.load_views(
             scene.path(spec.views), images=photos, masks=masks, missing_masks="abstain", max_size=spec.max_size,

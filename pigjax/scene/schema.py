@@ -55,7 +55,7 @@ class InputSpec(Section, frozen=True):
     images: str | None = None  # folder of the photos, where it is not the one that the cameras' file names
     masks: str | None = None  # folder of instance masks; None: `object_mask` beside the photos
     labels: str | None = None  # labels.npz of `pigjax segment`, instead of masks
-    names: str | None = None  # JSON of mask ids and names; None: objects need an `id`
+    names: str | None = None  # JSON of mask ids and names; None: `names.json` beside the photos, else an `id` each
     # of the longer side of photos, which shrink to it; None: as they are
     max_size: Annotated[int, Limits(1, 65536, unit="px")] | None = None
     # leave out Gaussians with NaN or infinity; by default the file is refused, since it may be damaged

@@ -7,8 +7,10 @@ import pytest
 
 from benchmarks import gallery
 from pigjax import io
+from pigjax.core.errors import InputError
 from pigjax.mpm.materials import PRESETS
-from pigjax.scene import load_scene
+from pigjax.scene import load_scene, scene_from
+from pigjax.scene.plan import read_inputs
 
 FOLDER = Path(__file__).parents[2] / "examples" / "materials"
 SCENES = {path.stem: path for path in FOLDER.glob("*.toml")}
@@ -69,3 +71,25 @@ def test_scene_of_a_capture_loads_and_takes_ten_lines_at_most(name):
     shows, source = gallery.told(CAPTURES[name])
     assert shows
     assert "pigjax reconstruct" in source
+
+
+def test_a_capture_needs_neither_names_in_the_scene_nor_masks_where_regions_choose(tmp_path):
+    """`names.json` is found beside the photos; without `object_mask` an object may still be chosen by a region."""
+    tabletop = FOLDER.parent / "tabletop"
+    for name in ("transforms.json", "images"):
+        (tmp_path / name).symlink_to(tabletop / name)
+    values = {
+        "input": {"gaussians": str(tabletop / "tabletop.ply"), "views": str(tabletop), "max_size": 16},
+        "simulation": {"dx": 0.02},
+        "objects": {"duck": {"material": "jelly"}},
+    }
+    found = read_inputs(scene_from(values, folder=tmp_path))
+    assert found.ids == {"duck": 2}
+    values["input"]["views"] = str(tmp_path)
+    values["objects"] = {"thing": {"material": "jelly", "within": {"lower": [-1, -1, 0.33], "upper": [1, 1, 1]}}}
+    found = read_inputs(scene_from(values, folder=tmp_path))
+    assert found.views.masks is None
+    assert not found.names
+    values["objects"] = {"thing": {"material": "jelly", "id": 1}}
+    with pytest.raises(InputError, match="object_mask: no such folder of masks"):
+        read_inputs(scene_from(values, folder=tmp_path))
