@@ -192,9 +192,10 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
         if entry.within is not None
     }
     asked = {name: k for name, k in inputs.ids.items() if name not in regions and name not in inputs.own}
+    masked = inputs.views is not None and inputs.views.masks is not None
     if inputs.stored is not None:
         labels = _stored(scene, inputs, asked)
-    elif inputs.views is not None:
+    elif masked:
         labels = _lifted(scene, inputs, asked)
     else:
         labels = _one_object(inputs, next(iter(asked.values()), 0))
@@ -206,7 +207,7 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
     for name, number in inputs.ids.items():
         if name not in inputs.own and not np.any(np.asarray(labels.object_id) == number):
             raise SceneError(f"objects.{name}: other objects took all its Gaussians; check objects.<name>.within.")
-    if inputs.stored is not None or inputs.views is not None:
+    if inputs.stored is not None or masked:
         found = np.unique(np.maximum(labels.object_id, 0))
         _warn_of_unnamed(inputs, found[found > 0])
     return labels

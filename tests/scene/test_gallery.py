@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks import gallery
@@ -10,7 +11,7 @@ from pigjax import io
 from pigjax.core.errors import InputError
 from pigjax.mpm.materials import PRESETS
 from pigjax.scene import load_scene, scene_from
-from pigjax.scene.plan import read_inputs
+from pigjax.scene.plan import read_inputs, segment
 
 FOLDER = Path(__file__).parents[2] / "examples" / "materials"
 SCENES = {path.stem: path for path in FOLDER.glob("*.toml")}
@@ -90,6 +91,8 @@ def test_a_capture_needs_neither_names_in_the_scene_nor_masks_where_regions_choo
     found = read_inputs(scene_from(values, folder=tmp_path))
     assert found.views.masks is None
     assert not found.names
+    members = np.asarray(segment(scene_from(values, folder=tmp_path), found).object_id) == found.ids["thing"]
+    np.testing.assert_array_equal(members, np.asarray(found.gaussians.means)[:, 2] >= 0.33)
     values["objects"] = {"thing": {"material": "jelly", "id": 1}}
     with pytest.raises(InputError, match="object_mask: no such folder of masks"):
         read_inputs(scene_from(values, folder=tmp_path))
