@@ -7,6 +7,7 @@ of scenes that lie in `--out` already, from the same files and level, are printe
 
 import os
 import re
+import shutil
 import time
 from pathlib import Path
 
@@ -58,6 +59,7 @@ def worker(name: str, out: str, data: str, accuracy: str) -> None:
             place = located(path, part, Path(data) if data else None)
             values["input"][key] = os.path.relpath(place, path.parent)
     scene = scene_from(values, folder=path.parent, where=name, accuracy=accuracy)
+    shutil.rmtree(Path(out) / name, ignore_errors=True)  # nothing of an earlier run is used again
     worked = time.process_time()  # hardly depends on other jobs; compilation included
     report = run_scene(scene, Path(out) / name)
     seconds = time.process_time() - worked

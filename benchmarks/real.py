@@ -174,7 +174,7 @@ def _move(scene: str, data: str, made: str) -> None:
     members = ", ".join(f"{name}: {count}" for name, count in report.sizes["gaussians_of"].items())
     sizes = [report.sizes[name] for name in ("particles", "frames")]
     least = f"{report.health['min_J']:.3f}" if "min_J" in report.health else ""
-    notes = "; ".join(report.warnings).replace("\n", " ")
+    notes = "; ".join(report.warnings).replace("\n", " ").replace(f"{Path(data).parent}/", "")
     print(row(path.stem, told(path)[0], members, *sizes, f"{seconds:.0f}", f"{peak_memory():.1f}", least, notes))
 
 

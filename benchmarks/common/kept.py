@@ -31,9 +31,9 @@ def kept_row(path: Path | None, asked: list[str], make: Callable[[], str]) -> st
 def fingerprint(files: Iterable[Path], base: Path) -> str:
     """Hash of files by name, relative to a folder where they lie in it, and content."""
     found = hashlib.sha256()
-    for path in sorted(files):
-        name = path.relative_to(base) if path.is_relative_to(base) else path.name
-        found.update(str(name).encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    named = {str(path.relative_to(base) if path.is_relative_to(base) else path.name): path for path in files}
+    for name, path in sorted(named.items()):
+        found.update(name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
     return found.hexdigest()
 
 
