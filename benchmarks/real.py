@@ -158,7 +158,12 @@ def motion(options) -> str:
             size = (240, round(240 * clip.shape[1] / clip.shape[2]))
             sheet = Image.fromarray(contact_sheet(tiles(clip, 8, size, name, named=0), 4, gap=2))
             few_colours(sheet, 256).save(options.media / f"real_{name}.png", optimize=True)
-            pictures += ["", picture(f"real_{name}.png", f"{told(scene)[0]}; {_SHOWN[name]}"), "", f"{_SHOWN[name]}."]
+            pictures += [
+                "",
+                picture(f"real_{name}.png", f"{told(scene)[0]}; {_SHOWN[name]}"),
+                "",
+                f"{_SHOWN[name][0].upper()}{_SHOWN[name][1:]}.",
+            ]
     return "\n".join(pictures)
 
 
