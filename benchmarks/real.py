@@ -60,7 +60,7 @@ SWITCHES = {
 }
 _CAMERAS = ("transforms.json", "transforms_train.json", "cameras.json", "sparse")  # one of them makes a capture
 # captures whose pictures may be shown, with their attribution
-_SHOWN = {"dinosaur": "photos of BlendedMVS (Yao et al. 2020, doi 10.1109/CVPR42600.2020.00186), CC BY 4.0"}
+_SHOWN = {"dinosaur": "Photos of BlendedMVS (Yao et al. 2020, doi 10.1109/CVPR42600.2020.00186), CC BY 4.0"}
 _MOST_SCORED = 12  # training photos whose score is averaged
 _LEGEND = (
     "PSNR and SSIM are means over the held-out photos, every eighth; least: the worst of them; gains fitted: mean PSNR"
@@ -162,7 +162,7 @@ def motion(options) -> str:
                 "",
                 picture(f"real_{name}.png", f"{told(scene)[0]}; {_SHOWN[name]}"),
                 "",
-                f"{_SHOWN[name][0].upper()}{_SHOWN[name][1:]}.",
+                f"{_SHOWN[name]}.",
             ]
     return "\n".join(pictures)
 
