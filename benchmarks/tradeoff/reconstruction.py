@@ -12,10 +12,10 @@ from benchmarks.tradeoff.points import Point, plot, table
 from pigjax import FitConfig, RenderConfig, lift_masks, load_points, load_views, reconstruct, render
 
 PLOT = "tradeoff_reconstruction.png"
-STANDARD = {"splats": 15_000, "steps": 1500, "sh_degree": 1, "max_size": 256}
+STANDARD = {"splats": 15_000, "steps": 1000, "sh_degree": 1, "max_size": 256}
 CHANGES = {
     "splats": (3750, 7500, 30_000),
-    "steps": (500, 4000),
+    "steps": (300, 2000),
     "sh_degree": (0, 2),
     "max_size": (64, 128),
 }
@@ -34,8 +34,7 @@ def study(options) -> str:
     for name, values in CHANGES.items():
         settings |= {f"{value:,} {SHORT[name]}" if name != "sh_degree" else f"SH {value}": STANDARD | {name: value}
                      for value in values}  # fmt: skip
-    settings["3,750 splats, 500 steps"] = STANDARD | {"splats": 3750, "steps": 500}
-    settings["30,000 splats, 4,000 steps"] = STANDARD | {"splats": 30_000, "steps": 4000}
+    settings["3,750 splats, 300 steps"] = STANDARD | {"splats": 3750, "steps": 300}
     full = load_views(TABLETOP, masks=True, background=1.0)
     points = []
     for name, setting in settings.items():
