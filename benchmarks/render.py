@@ -207,7 +207,7 @@ def _rgb(gaussians, camera, config):
 def over(options):
     """A picture of which a share moves, over a still one, beside the whole picture."""
     print(
-        "The splats in one half of the image, or a quarter of its height, move; the time is beside the whole picture.\n"
+        "The splats below the middle of the image, or in its lower quarter or tenth, move; the ball covers 40 % of it.\n"
     )
     print(head("splats", "pixels", "tiles redrawn %", "whole ms", "over ms", "share", "largest difference"))
     for text in options.rows:

@@ -136,7 +136,7 @@ def render_over(
         everywhere: draw all tiles, which gives `render`'s picture without a second program; False by default.
 
     Returns:
-        RGB, equal to that of `render`.
+        RGB, equal to that of `render` up to rounding: shorter lists are cut into passes at other places.
 
     Raises:
         InputError: a batch of cameras.

@@ -646,7 +646,7 @@ def test_pictures_and_gradients_are_those_of_the_form_for_accelerators(x64, monk
 
 @pytest.mark.parametrize("bands", [1, 2])
 def test_a_picture_over_a_still_one_is_that_of_all_splats(bands, two_devices):
-    """Bit by bit: tiles that no moving splat may touch hold the same splats in the same order."""
+    """Bit by bit in one pass: tiles that no moving splat may touch hold the same splats in the same order."""
     scene, camera = make_scene(degree=1, seed=3)
     everything = gaussians_of(scene)
     moving = jnp.arange(len(everything)) % 20 == 0
