@@ -206,9 +206,7 @@ def _rgb(gaussians, camera, config):
 
 def over(options):
     """A picture of which a share moves, over a still one, beside the whole picture."""
-    print(
-        "The splats below the middle of the image, or in its lower quarter or tenth, move; the ball covers 40 % of it.\n"
-    )
+    print("The splats below the middle of the image, or in its lower quarter or tenth, move.\n")
     print(head("splats", "pixels", "tiles redrawn %", "whole ms", "over ms", "share", "largest difference"))
     for text in options.rows:
         count, width, height = size_of(text)
