@@ -13,7 +13,6 @@ import json
 import os
 import platform
 import statistics
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,7 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import pigjax as pj
-from benchmarks.common.pages import ROOT, head, row
+from benchmarks.common.kept import commit
+from benchmarks.common.pages import head, row
 from benchmarks.common.timing import clock, machine
 from benchmarks.common.yardsticks import TASKS
 from pigjax.mpm import reference as plain_matter
@@ -245,16 +245,6 @@ def with_entry(entries: list[dict[str, Any]], entry: dict[str, Any]) -> list[dic
     own = [old for old in kept if old["kind"] == entry["kind"]]
     too_old = own[: max(len(own) - MOST_ENTRIES, 0)]
     return [old for old in kept if old not in too_old]
-
-
-def commit() -> str:
-    """Short name of the commit, with a plus where files are changed."""
-
-    def git(*words):
-        return subprocess.run(["git", *words], cwd=ROOT, text=True, capture_output=True, check=False).stdout.strip()
-
-    changed = git("status", "--porcelain", "--untracked-files=no", "--", "pigjax")
-    return git("rev-parse", "--short", "HEAD") + "+" * bool(changed)
 
 
 def compare(options):

@@ -38,6 +38,10 @@ def fingerprint(files: Iterable[Path], base: Path) -> str:
 
 
 def commit() -> str:
-    """Short name of the commit, with + where files were changed since."""
-    said = subprocess.run(("git", "describe", "--always", "--dirty=+"), cwd=ROOT, capture_output=True, text=True)
-    return said.stdout.strip()
+    """Short name of the commit, with a plus where files are changed."""
+
+    def git(*words):
+        return subprocess.run(["git", *words], cwd=ROOT, text=True, capture_output=True, check=False).stdout.strip()
+
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", "pigjax")
+    return git("rev-parse", "--short", "HEAD") + "+" * bool(changed)

@@ -152,3 +152,12 @@ def test_names_and_spacing_are_checked(folder):
     base["simulation"].pop("dx", None)
     with pytest.raises(SceneError, match=r"simulation\.dx.*volumes"):
         scene_from(base | {"volumes": {"water": shape}}, folder=folder)
+
+
+def test_a_sheen_needs_the_bands_of_colour_that_draw_it(folder):
+    shape = {"centre": [0, 0, 0], "radius": 1.0, **WATER, "surface": "smooth", "sheen": 0.5}
+    base = values(objects={"ball": {"id": 1, "material": "jelly", "young": 2e3}}, simulation__dx=0.08)
+    asked = base | {"volumes": {"water": shape}, "drawing": {"sh_degree": 1}}
+    with pytest.raises(SceneError, match=r"drawing\.sh_degree.*sheen"):
+        scene_from(asked, folder=folder)
+    assert scene_from(asked | {"drawing": {"sh_degree": 2}}, folder=folder)
