@@ -122,6 +122,13 @@ def look_at(
         raise InputError(f"look_at: eye and target are the same point {_plain(position)}; move one of them.")
     if _equal(above, jnp.zeros_like(above)):
         raise InputError("look_at: up = (0, 0, 0) points nowhere; give a direction such as (0, 0, 1).")
+    size = jnp.asarray([width, height], position.dtype)
+    return Camera(_looking(position, goal, above), jnp.full(2, focal, position.dtype), size / 2, width, height)
+
+
+@jax.jit
+def _looking(position: Float[Array, "3"], goal: Float[Array, "3"], above: Float[Array, "3"]) -> Float[Array, "4 4"]:
+    """Pose of a camera at a position that looks at a goal; one program instead of forty small ones."""
     forward = (goal - position) / jnp.linalg.norm(goal - position)
     right = jnp.cross(forward, above / jnp.linalg.norm(above))
     y_axis, z_axis = jnp.eye(3, dtype=position.dtype)[1:]
@@ -129,10 +136,7 @@ def look_at(
     right = jnp.where(jnp.sum(right**2) > _ALONG**2, right, other)
     right = right / jnp.linalg.norm(right)
     rotation = jnp.stack([right, jnp.cross(forward, right), forward])
-    dtype = position.dtype
-    world_to_cam = jnp.eye(4, dtype=dtype).at[:3, :3].set(rotation).at[:3, 3].set(-matmul(rotation, position))
-    size = jnp.asarray([width, height], dtype)
-    return Camera(world_to_cam, jnp.full(2, focal, dtype), size / 2, width, height)
+    return jnp.eye(4, dtype=position.dtype).at[:3, :3].set(rotation).at[:3, 3].set(-matmul(rotation, position))
 
 
 def require_one(camera: Camera, name: str) -> None:
@@ -232,11 +236,15 @@ def orbit(
     azimuth = start + sweep * np.arange(frames) / frames
     around = np.cos(azimuth)[:, None] * first + np.sin(azimuth)[:, None] * np.cross(above, first)
     eyes = np.asarray(target) + radius * (np.cos(elevation) * around + np.sin(elevation) * above)
-    look = partial(look_at, target=target, focal=focal, width=width, height=height)
     # seen from a pole, the axis is the line of sight; the meridian continues into the upward direction
     poles = abs(np.cos(elevation)) < _ALONG
     ups = -np.sign(np.sin(elevation)) * around if poles else np.broadcast_to(above, eyes.shape)
-    return stack_cameras([look(eye, up=top) for eye, top in zip(eyes, ups)])
+    first_camera = look_at(eyes[0], target, up=ups[0], focal=focal, width=width, height=height)
+    kind = first_camera.world_to_cam.dtype
+    goal = jnp.asarray(target, kind)
+    poses = jax.vmap(_looking, in_axes=(0, None, 0))(jnp.asarray(eyes, kind), goal, jnp.asarray(ups, kind))
+    focals, centres = (jnp.tile(values, (frames, 1)) for values in (first_camera.focal, first_camera.centre))
+    return Camera(poses, focals, centres, width, height)
 
 
 @checked
