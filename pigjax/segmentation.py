@@ -22,6 +22,7 @@ from pigjax.core.arguments import checked
 from pigjax.core.arrays import Scalar, array_field, in_precision, is_known, real_field
 from pigjax.core.camera import Camera, project
 from pigjax.core.errors import InputError
+from pigjax.core.quick import quickly
 from pigjax.splat import Gaussians, RenderConfig, Splats, backproject, pairs_of, render, required_capacity
 from pigjax.splatting.binning import blend_config
 from pigjax.splatting.contributions import credits_of_candidates, soft_surface_depth
@@ -218,7 +219,7 @@ def pixel_ids(
     return np.asarray(winner), shares
 
 
-@eqx.filter_jit
+@quickly(once=True)
 def _shares(splats: Splats, object_id, group, camera: Camera, config: RenderConfig):
     """Share [h w m] of each id of the group, and the coverage [h w] of all splats."""
     membership = (object_id[:, None] == group).astype(splats.opacities.dtype)
@@ -285,7 +286,7 @@ def enough_capacity(gaussians: Gaussians | Splats, cameras: Camera, config: Rend
     return dataclasses.replace(config, capacity=1 << max(needed - 1, 1).bit_length())
 
 
-@eqx.filter_jit
+@quickly
 def _collect(splats, cameras, masks, thresholds, num_ids, weighting, config, partial):
     """Votes [n m] of all views, and the splat/tile pairs that the renderer dropped; `partial`: masks have gaps."""
     tau_T, tau_d, temperature = thresholds
@@ -321,7 +322,7 @@ def _collect(splats, cameras, masks, thresholds, num_ids, weighting, config, par
     return lax.scan(one_view, start, (cameras, masks))[0]
 
 
-@eqx.filter_jit
+@quickly(once=True)
 def _left_out(splats: Splats, cameras: Camera, config: RenderConfig):
     """Splat/tile pairs that the scan for tied Gaussians drops for want of capacity, over all views."""
 
@@ -386,7 +387,7 @@ def _credits(splats: Splats, camera: Camera, mask, num_ids: int, config: RenderC
     return credits.transpose(1, 0, 2).reshape(len(splats), -1)[:, :num_ids], overflow[0]
 
 
-@eqx.filter_jit
+@quickly
 def _elect(votes, background: str, min_votes, purity, break_ties):
     """Winning id and its share of the votes; `break_ties` turns candidates [n j], -1 for none, into credits [n j]."""
     objects, none = votes[:, 1:], votes[:, 0]

@@ -1,0 +1,65 @@
+"""Programs that run once or a few times: compiled with less effort where the compiler has a choice. Leaf."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from pigjax.core.arrays import is_compiling, is_known
+
+# What draws is compiled in two thirds of the processor time and runs as fast; steps of matter would run half as fast.
+_DRAWING: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
+# In a sixth of the time, and four times slower to run: for what runs once.
+_ONCE: dict[str, Any] = {**_DRAWING, "xla_backend_optimization_level": 0}
+
+
+def quick_options(*, once: bool = False) -> dict[str, Any]:
+    """Options of `Lowered.compile` and `jax.jit` for a program that draws; none where this XLA does not know them.
+
+    Args:
+        once: whether it will run a single time.
+    """
+    return dict(_known(once, jax.default_backend()))
+
+
+def quickly(function: Callable | None = None, *, once: bool = False) -> Any:
+    """`eqx.filter_jit`, by `quick_options` where the function is called with known values outside of any trace.
+
+    Args:
+        function: of pytrees; may be left out to give `once`.
+        once: whether each of its programs will run a single time.
+    """
+    if function is None:
+        return functools.partial(quickly, once=once)
+    traced = eqx.filter_jit(function)
+
+    @functools.cache
+    def outermost(backend: str) -> Callable:
+        jit: Any = eqx.filter_jit
+        return jit(function, compiler_options=_known(once, backend))
+
+    @functools.wraps(function)
+    def call(*args: Any) -> Any:
+        if not is_known(args) or is_compiling():
+            return traced(*args)
+        return outermost(jax.default_backend())(*args)
+
+    return call
+
+
+@functools.cache
+def _known(once: bool, backend: str) -> dict[str, Any]:
+    """The options, if they are accepted."""
+    options = _ONCE if once else _DRAWING
+    if backend != "cpu":
+        return {}
+    try:
+        jax.jit(lambda number: number + 1).lower(np.float32(0)).compile(compiler_options=options)
+    except Exception:  # of whatever kind a later XLA has for options that it does not know
+        return {}
+    return options
