@@ -38,6 +38,7 @@ jax.config.update("jax_num_cpu_devices", 2)  # for what several devices share
 def pytest_configure(config):
     """Start JAX: it reads the flags, and commands that a test starts do not see them. Those given from outside win."""
     share_compiled_programs(config)
+    os.environ["PIGJAX_COMPILE_CACHE"] = "off"  # commands keep no results where tests could meet them
     given = os.environ.get("XLA_FLAGS")
     if config.option.markexpr == "not slow":
         if ACCEPTED not in os.environ:

@@ -20,7 +20,7 @@ from pigjax.mpm.colliders import Plane
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.forces import ForceField, Spring, Wind
 from pigjax.mpm.materials import LAWS, Material, Parameters, material_table, respond
-from pigjax.scene.run import shaded_picture
+from pigjax.scene.pictures import shaded_picture
 from pigjax.splat import RenderConfig
 from pigjax.splatting.shadows import Light
 from pigjax.splatting.types import as_splats
@@ -288,7 +288,7 @@ def test_a_picture_without_a_light_traces_no_shadows(monkeypatch):
 
     shade = jnp.ones(20, bool), Light(direction=(0.0, 0.0, -1.0)), jnp.ones(20), jnp.ones(20)
     on = primitives(jax.make_jaxpr(drawn)(gaussians, splats, shade))
-    monkeypatch.setattr("pigjax.scene.run.cast_shadows", None)  # calling it would fail
+    monkeypatch.setattr("pigjax.scene.pictures.cast_shadows", None)  # calling it would fail
     off = primitives(jax.make_jaxpr(drawn)(gaussians, splats, None))
     assert on.total() > off.total()
     assert not {name for name in off if off[name] > on[name]}

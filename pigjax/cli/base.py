@@ -26,6 +26,7 @@ from rich.text import Text
 
 from pigjax.core.errors import InputError
 from pigjax.io.compile_cache import SWITCH, use_compile_cache
+from pigjax.io.result_cache import use_result_cache
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -99,7 +100,7 @@ def _without_cache(no_cache: bool) -> bool:
 
 NoCache = Annotated[
     bool,
-    typer.Option("--no-cache", help="Recompile all programs, and store none.", callback=_without_cache),
+    typer.Option("--no-cache", help="Recompile all programs and vote anew; store nothing.", callback=_without_cache),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors alone.", callback=_hush)]
 
@@ -122,12 +123,13 @@ def row(*cells: object) -> tuple[Text, ...]:
 
 
 def prepare_jax() -> None:
-    """Use all cores, keep compiled programs for the next command, and look for garbage less often.
+    """Use all cores, keep programs and results for the next command, and look for garbage less often.
 
     Tracing makes objects by the million, and hardly any of them is garbage: looking at the default rate slows it down.
     """
     one_device_per_core()
     use_compile_cache()
+    use_result_cache()
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
 

@@ -135,7 +135,7 @@ def split(gaussians: Gaussians, widest: float, around: tuple[np.ndarray, float] 
     """
     host = jax.tree.map(np.asarray, gaussians)
     scales = np.exp(host.log_scales.astype(np.float64))
-    axes = np.asarray(quat_to_matrix(gaussians.quats), np.float64)
+    axes = np.asarray(jax.jit(quat_to_matrix)(gaussians.quats), np.float64)
     opacity = 1 / (1 + np.exp(-host.logit_opacities.astype(np.float64)))
     wide = (scales > widest).any(1)
     rows, offsets, logits, sizes = [np.flatnonzero(~wide)], [np.zeros(((~wide).sum(), 3))], [], []

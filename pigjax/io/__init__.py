@@ -36,6 +36,7 @@ from pigjax.io.page import save_page
 from pigjax.io.ply import load_ply, load_points, read_ply, save_ply
 from pigjax.io.points import save_points
 from pigjax.io.provenance import check_same, claim, digest, file_digest, parts_of
+from pigjax.io.result_cache import kept
 from pigjax.io.state import (
     ROWS,
     STATES,
@@ -75,6 +76,7 @@ __all__ = [
     "example_folder",
     "file_digest",
     "id_named",
+    "kept",
     "last_state",
     "load_array",
     "load_arrays",

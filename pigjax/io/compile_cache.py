@@ -11,24 +11,32 @@ from pathlib import Path
 
 LIMIT = 1 << 30  # bytes; a demo leaves some 40 MB
 SWITCH = "PIGJAX_COMPILE_CACHE"  # a folder, or "off"
-_SHORTEST = 0.05  # s; reading a program back takes some 10 ms
+_SHORTEST = 0.01  # s; reading a program back takes some 6 ms
 _OFF = ("off", "0", "no", "false")
 
 
-def cache_folder() -> Path | None:
-    """Folder of the programs of this processor; None where nothing is kept.
+def cache_root() -> Path | None:
+    """Folder of all that commands keep; None where nothing is kept.
 
     The environment decides: `PIGJAX_COMPILE_CACHE` names a folder or says "off"; continuous integration (`CI`) keeps
-    nothing. Programs hold the processor's own instructions, so that each kind of processor has a folder.
+    nothing.
     """
     given = os.environ.get(SWITCH, "")
     if given.lower() in _OFF or (not given and os.environ.get("CI", "").lower() not in ("", *_OFF)):
         return None
     try:
-        root = Path(given).expanduser() if given else _user_cache() / "pigjax"
+        return Path(given).expanduser() if given else _user_cache() / "pigjax"
     except RuntimeError:  # there is no home folder
         return None
-    return root / f"xla-{hashlib.sha256(_processor().encode()).hexdigest()[:12]}"
+
+
+def cache_folder() -> Path | None:
+    """Folder of the programs of this processor; None where nothing is kept.
+
+    Programs hold the processor's own instructions, so that each kind of processor has a folder.
+    """
+    root = cache_root()
+    return None if root is None else root / f"xla-{hashlib.sha256(_processor().encode()).hexdigest()[:12]}"
 
 
 def use_compile_cache() -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,7 @@ from jaxtyping import Float
 from msgspec.structs import replace as with_fields
 from scipy.spatial.transform import Rotation
 
+from pigjax import io
 from pigjax.core.checks import joined
 from pigjax.core.errors import InputError, SceneError
 from pigjax.core.extent import scene_extent
@@ -22,7 +25,7 @@ from pigjax.coupling.hidden import fill_hidden
 from pigjax.coupling.outliers import cut_outliers
 from pigjax.coupling.vessel import CLEAR, box_points, points_in_vessel
 from pigjax.mpm.colliders import Collider, SampledDistance
-from pigjax.scene.plan import Inputs, still_solids, with_id
+from pigjax.scene.plan import Inputs, arrays_of, of_arrays, still_solids, with_id
 from pigjax.scene.schema import ObjectSpec, Scene, VolumeSpec
 from pigjax.scene.world import axis_of
 from pigjax.segmentation import Labels
@@ -96,19 +99,23 @@ def _filled(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Inputs, Label
     for name, entry in scene.objects.items():
         if not entry.fill:
             continue
-        found = fill_hidden(
-            inputs.gaussians,
-            labels,
-            inputs.ids[name],
-            hidden_by=hiding,
-            up=axis_of(scene.input.up),
-            eyes=eyes,
-            name=joined("objects", name),
-        )
-        counts = {"added": found.added, "recoloured": found.recoloured}
-        inputs = replace(inputs, gaussians=found.gaussians, arranged=True, filled={**inputs.filled, name: counts})
-        labels = found.labels
+        settings = {"hidden_by": hiding, "up": axis_of(scene.input.up), "eyes": eyes, "name": joined("objects", name)}
+        given = inputs.gaussians, labels, inputs.ids[name]
+        found, before = io.kept("fill", (given, settings), partial(_closed, *given, **settings))
+        counts = {count: int(found.pop(count)) for count in ("added", "recoloured")}
+        filled = {**inputs.filled, name: counts}
+        gaussians, labels = of_arrays(Gaussians, found, "gaussians."), of_arrays(Labels, found, "labels.")
+        inputs = replace(inputs, gaussians=gaussians, arranged=True, filled=filled)
+        inputs.reused.extend([f"surface of {name}"] * before)
     return inputs, labels
+
+
+def _closed(*given: Any, **settings: Any) -> dict[str, Any]:
+    """Arrays of `fill_hidden`, by name."""
+    found = fill_hidden(*given, **settings)
+    gaussians = {f"gaussians.{name}": values for name, values in arrays_of(found.gaussians).items()}
+    labels = {f"labels.{name}": values for name, values in arrays_of(found.labels).items()}
+    return {**gaussians, **labels, "added": found.added, "recoloured": found.recoloured}
 
 
 def with_volumes(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs, Labels]:
@@ -237,9 +244,9 @@ def appended(labels: Labels, counts: list[int], owners: list[int]) -> Labels:
     more = sum(counts)
     labels = replace(
         labels,
-        object_id=jnp.pad(labels.object_id, (0, more)),
-        votes=jnp.pad(labels.votes, ((0, more), (0, 0))),
-        confidence=jnp.pad(labels.confidence, (0, more)),
+        object_id=jnp.asarray(np.pad(labels.object_id, (0, more))),
+        votes=jnp.asarray(np.pad(labels.votes, ((0, more), (0, 0)))),
+        confidence=jnp.asarray(np.pad(labels.confidence, (0, more))),
     )
     at = len(labels.object_id) - more
     for count, owner in zip(counts, owners):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -151,20 +152,24 @@ def with_own(
             parts.append((_fainter(poured, entry.transparency), carriers))
             continue
         members = np.flatnonzero(object_id == inputs.ids[name])
-        mine = jax.tree.map(lambda values, members=members: values[members], inputs.gaussians)
+        mine = _rows(inputs.gaussians, members)
         settings: dict[str, Any] = {} if entry.refit else {"steps": 0}
         axis = axis_of(scene.input.up)  # about which the fit's cameras stand
         mark = io.digest(mine, x[rows], plan.dx, entry.inside, axis, settings, make_own_splats)
         made = _stored(stored or {}, f"{MADE}_{number}", mark)
         if made is None:
-            made = make_own_splats(mine, x[rows], dx=plan.dx, up=axis, inside=entry.inside, **settings)
+            settings |= {"dx": plan.dx, "up": axis, "inside": entry.inside}
+            found, before = io.kept("own_splats", (mark,), partial(_made, mine, x[rows], mark, settings))
+            made = _stored(found, MADE, mark)
+            assert made is not None
+            inputs.reused.extend([f"splats of {name}"] * before)
             fit = (
                 f"at rest {made.psnr:.1f} dB to them in views not fitted ({made.start:.1f} before the fit)"
                 if entry.refit else "as they are cut"
             )  # fmt: skip
             say(
                 f"{name}: {len(mine)} Gaussians give way to {len(made.gaussians)} splats of its own; {fit};"
-                f" {made.seconds:.0f} s."
+                f" {'kept from an earlier command' if before else f'{made.seconds:.0f} s'}."
             )
         arrays |= _arrays(made, f"{MADE}_{number}", mark)
         parts.append((_fainter(made.gaussians, entry.transparency), rows[made.carrier]))
@@ -172,9 +177,11 @@ def with_own(
     place = np.full(len(object_id) + 1, -1)
     place[kept] = np.arange(len(kept))
     everything = jax.tree.map(
-        lambda old, *new: jnp.concatenate([old[kept], *new]), inputs.gaussians, *(part for part, _ in parts)
-    )
-    labels = replace(plan.labels, **{f: getattr(plan.labels, f)[kept] for f in ("object_id", "votes", "confidence")})
+        lambda *columns: jnp.asarray(np.concatenate([np.asarray(column) for column in columns])),
+        _rows(inputs.gaussians, kept), *(part for part, _ in parts),
+    )  # fmt: skip
+    own = {f: jnp.asarray(np.asarray(getattr(plan.labels, f))[kept]) for f in ("object_id", "votes", "confidence")}
+    labels = replace(plan.labels, **own)
     labels = appended(labels, [len(part) for part, _ in parts], [inputs.ids[name] for name in names])
     carrier = np.concatenate([np.full(len(kept), -1), *(carriers for _, carriers in parts)])
     particles = replace(plan.particles, gaussian=jnp.asarray(place[np.asarray(plan.particles.gaussian)], jnp.int32))
@@ -193,6 +200,11 @@ def with_own(
     return inputs, replace(plan, particles=particles, labels=labels, binding=binding), arrays
 
 
+def _rows(gaussians: Gaussians, rows: Int[np.ndarray, "m"]) -> Gaussians:
+    """Some of the Gaussians. On the host: JAX would compile a program for each of so many sizes."""
+    return jax.tree.map(lambda values: jnp.asarray(np.asarray(values)[rows]), gaussians)
+
+
 def is_grainy(entry: ObjectSpec, law: str) -> bool:
     """Whether a volume is drawn as grains: its brightness varies, and it is no fluid."""
     return isinstance(entry, VolumeSpec) and entry.grain > 0 and law != "fluid"
@@ -206,7 +218,7 @@ def _of_volume(
     They are those that its particles have, on a smooth surface where it is a fluid, and several where it has grains.
     """
     carried = np.asarray(plan.particles.gaussian)[rows]
-    mine = jax.tree.map(lambda values: values[carried], gaussians)
+    mine = _rows(gaussians, carried)
     if is_grainy(entry, law):
         return _grains(mine, entry), np.repeat(rows, GRAINS)
     if entry.surface == "smooth" and law == "fluid":
@@ -236,6 +248,10 @@ def _fainter(gaussians: Gaussians, transparency: float) -> Gaussians:
         return gaussians
     opacity = jax.nn.sigmoid(gaussians.logit_opacities) * (1 - transparency)
     return replace(gaussians, logit_opacities=jax.scipy.special.logit(jnp.maximum(opacity, 1e-6)))
+
+
+def _made(gaussians: Gaussians, x: Float[np.ndarray, "p 3"], mark: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    return _arrays(make_own_splats(gaussians, x, **settings), MADE, mark)
 
 
 def _arrays(made: OwnSplats, prefix: str, mark: str) -> dict[str, np.ndarray]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import itertools
 import math
 import warnings
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,7 @@ from pigjax.coupling.seeding import seed_particles
 from pigjax.coupling.vessel import vessel_from_gaussians
 from pigjax.mls_mpm import SimConfig
 from pigjax.mpm import Particles
-from pigjax.mpm.colliders import Collider
+from pigjax.mpm.colliders import Collider, SampledDistance
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.forces import Force
 from pigjax.mpm.materials import Material, MaterialTable
@@ -44,6 +45,7 @@ from pigjax.segmentation import Labels, fill_unseen
 from pigjax.splat import Gaussians, RenderConfig
 from pigjax.splatting.types import extent_of
 
+Kept = TypeVar("Kept", Labels, Gaussians)
 _FRAMED = 0.999  # share of the moving matter that the default orbit frames: the tip of a leaf is less than a hundredth
 _ROOM = 1.1  # times that distance, for what sways
 
@@ -64,6 +66,7 @@ class Inputs:
     solids: tuple[float, dict[str, Collider]] | None = None  # still objects as colliders, and the spacing they are for
     arranged: bool = False  # whether objects were placed, copied, removed or filled
     filled: dict[str, dict[str, int]] = field(default_factory=dict)  # Gaussians "added" and "recoloured", by object
+    reused: list[str] = field(default_factory=list)  # what an earlier command had made from the same, and kept
 
     @property
     def moved(self) -> bool:
@@ -238,21 +241,33 @@ def _lifted(scene: Scene, inputs: Inputs, asked: dict[str, int]) -> Labels:
     views = inputs.views.voters
     assert views.masks is not None
     check_ids_occur(asked, views.masks)
-    labels = lift(
-        inputs.gaussians,
-        views.cameras,
-        views.masks,
-        fill=spec.fill_unseen,
-        tau_T=spec.tau_T,
-        tau_d=spec.tau_d,
-        background=spec.background,
-        valid=views.valid,
-    )
+    given = inputs.gaussians, views.cameras, views.masks
+    settings: dict[str, Any] = {
+        "fill": spec.fill_unseen,
+        "tau_T": spec.tau_T,
+        "tau_d": spec.tau_d,
+        "background": spec.background,
+        "valid": views.valid,
+    }
+    arrays, before = io.kept("votes", (given, settings), lambda: arrays_of(lift(*given, **settings)))
+    labels = of_arrays(Labels, arrays)
+    inputs.reused.extend(["votes"] * before)
     found = np.unique(np.maximum(labels.object_id, 0))
     for name, number in asked.items():
         if number not in found:
             raise SceneError(f"objects.{name}: no Gaussian has its id {number} in the masks; check input.masks.")
     return labels
+
+
+def arrays_of(value: Labels | Gaussians) -> dict[str, Any]:
+    """The fields that are set, by name."""
+    return {f.name: there for f in fields(value) if (there := getattr(value, f.name)) is not None}
+
+
+def of_arrays(kind: type[Kept], arrays: Mapping[str, np.ndarray], prefix: str = "") -> Kept:
+    """The labels or Gaussians of `arrays_of`; a prefix begins the names of theirs."""
+    there = {f.name: jnp.asarray(arrays[prefix + f.name]) for f in fields(kind) if prefix + f.name in arrays}
+    return kind(**there)
 
 
 def check_ids_occur(ids: dict[str, int], masks: Any) -> None:
@@ -379,19 +394,25 @@ def still_solids(scene: Scene, inputs: Inputs, labels: Labels, dx: float) -> dic
             continue
         members = np.flatnonzero(object_id == inputs.ids[name])
         own = jax.tree.map(lambda values, members=members: jnp.asarray(np.asarray(values)[members]), inputs.gaussians)
-        where, up = joined("objects", name), axis_of(scene.input.up)
+        where, spacing, up = joined("objects", name), dx / 2, axis_of(scene.input.up)
         if entry.hollow:
-            solids[name] = vessel_from_gaussians(own, spacing=dx / 2, up=up, friction=entry.friction, name=where)
-            continue
-        solids[name] = collider_from_gaussians(
-            own,
-            spacing=dx / 2,
-            up=up,
-            friction=entry.friction,
-            others=np.delete(np.asarray(inputs.gaussians.means), members, axis=0),
-            eyes=None if entry.is_placed else eyes,  # elsewhere they did not see it
-            name=where,
-        )
+            make: Callable[..., SampledDistance] = vessel_from_gaussians
+            settings: dict[str, Any] = {"spacing": spacing, "up": up, "name": where}
+        else:
+            make = collider_from_gaussians
+            others = np.delete(np.asarray(inputs.gaussians.means), members, axis=0)
+            seen_from = None if entry.is_placed else eyes  # elsewhere they did not see it
+            settings = {"spacing": spacing, "up": up, "name": where, "others": others, "eyes": seen_from}
+
+        def arrays(make=make, own=own, settings=settings) -> dict[str, Any]:
+            solid = make(own, **settings)
+            return {"samples": solid.samples, "origin": solid.origin, "dx": solid.dx}
+
+        found, before = io.kept("solid", (own, entry.hollow, settings), arrays)
+        samples, origin, step = (jnp.asarray(found[key]) for key in ("samples", "origin", "dx"))
+        friction = jnp.asarray(entry.friction, jnp.result_type(float))
+        solids[name] = SampledDistance(samples=samples, origin=origin, dx=step, friction=friction)
+        inputs.reused.extend([f"solid of {name}"] * before)
     return solids
 
 

@@ -3,38 +3,29 @@
 from __future__ import annotations
 
 import os
-import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from pigjax import io
 from pigjax.core.arguments import checked
-from pigjax.core.camera import Camera
 from pigjax.core.errors import InputError, SimulationError, StaleError
-from pigjax.core.linalg import safe_norm
-from pigjax.coupling.binding import carried_gaussians, deform
 from pigjax.mpm import Particles
 from pigjax.mpm.active_grid import ActiveGrid
 from pigjax.mpm.simulate import SimulatedFrame
 from pigjax.mpm.sleep import Sleeper
-from pigjax.objects.overlay import legend_sheet, overlay
 from pigjax.scene.advice import plan_line
 from pigjax.scene.arrangement import arrange
 from pigjax.scene.budget import ScenePlan, refined
 from pigjax.scene.costs import Comparison, Pace, Prediction, predict
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
-from pigjax.scene.own import MADE, Surfaces, chosen, is_torn, laws_of, surfaces_of, waits_for_motion, with_own
-from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
+from pigjax.scene.own import MADE, chosen, is_torn, laws_of, surfaces_of, waits_for_motion, with_own
+from pigjax.scene.pictures import SHEET_FRAMES, Pictures, Progress, draw_run
+from pigjax.scene.plan import Inputs, Plan, make_plan, provenance, read_inputs, segment
 from pigjax.scene.replay import COLLIDER_FILE, REST_FILE, SCENE_FILE, rows_of, store_colliders, store_rest
 from pigjax.scene.report import RunReport
 from pigjax.scene.report_page import report_page
@@ -43,17 +34,12 @@ from pigjax.scene.run_error import Followed, estimated_error
 from pigjax.scene.schema import Scene, values_of
 from pigjax.scene.stages import Stage, simulate_stages, stages_of
 from pigjax.scene.world import described
-from pigjax.segmentation import Labels, pixel_ids
-from pigjax.splat import Gaussians, RenderConfig, Splats, render, render_over
-from pigjax.splatting.shadows import Light, cast_shadows, light_transmittance
+from pigjax.segmentation import Labels
 
-_SHEET_FRAMES = 12
-_UNSEEN = -40.0  # logit of an opacity that is never drawn
 _FILES = (
     "video.mp4", "contact_sheet.png", "objects.png", "labels.npz", COLLIDER_FILE, REST_FILE, SCENE_FILE, "report.json",
     "report.html",
 )  # fmt: skip
-Progress = Callable[[str, int, int], None]  # stage, done, of
 Say = Callable[[str], None]  # a line to read before the long work
 
 
@@ -174,7 +160,7 @@ def _run(
     if not (later := own_wanted and waits_for_motion(scene, laws)):
         if own_wanted:
             make_own()
-        pictures = _Pictures.of(scene, seen, shown)
+        pictures = Pictures.of(scene, seen, shown)
     states = _simulate(scene, plan, stages, out / "states", parts, key, report, tell, told, prediction)
     followed = None
     if frames := min(scene.output.error_frames, scene.simulation.frames):
@@ -186,9 +172,11 @@ def _run(
                 pass
     if later:
         make_own()
+    report.modelled["reused"] = inputs.reused
     with report.stage("draw"):
-        pictures = pictures or _Pictures.of(scene, seen, shown)
-        _draw(scene, seen, shown, shown.labels, pictures, out, key, report, tell, states, surfaces)
+        pictures = pictures or Pictures.of(scene, seen, shown)
+        draw_run(scene, seen, shown, shown.labels, pictures, out, key, report, tell, states, surfaces)
+        report.files |= {name.split(".")[0]: str(out / name) for name in (*_FILES, "states")}
     if followed is not None:
         with report.stage("estimate"):
             tell("estimate", 0, 1)
@@ -208,7 +196,7 @@ def _predict(
     first = stages[0].rule
     needs = counted(
         scene, inputs, plan, substeps=first.first, integrator=first.config.integrator,
-        voted=inputs.stored is None and inputs.views is not None,
+        voted=inputs.stored is None and inputs.views is not None and "votes" not in inputs.reused,
     )  # fmt: skip
     prediction = predict(needs) if planned is None else refined(planned, needs)
     report.plan = plan_line(needs, prediction)
@@ -260,7 +248,7 @@ def _was_torn(scene: Scene, inputs: Inputs, rows: dict[str, np.ndarray], folder:
         )
         return False
     own = rows["object"] == inputs.ids[name]
-    frames = np.unique(np.linspace(0, scene.simulation.frames, _SHEET_FRAMES).round().astype(int)).tolist()
+    frames = np.unique(np.linspace(0, scene.simulation.frames, SHEET_FRAMES).round().astype(int)).tolist()
     return any(is_torn(io.load_state(folder, frame, signature=key)["F_visual"][own]) for frame in reversed(frames))
 
 
@@ -411,185 +399,3 @@ def _save(folder: Path, frame: int, particles: Particles, record: Record, key: s
 
 def _checkpoint(path: Path, frame: int, particles: Particles, active: ActiveGrid, parts: dict[str, str]) -> None:
     io.save_pytree(path, (np.asarray(frame), particles, active.memory()), parts=parts)
-
-
-def shaded_picture(
-    gaussians: Gaussians,
-    splats: Splats,
-    camera: Camera,
-    shade: tuple[jax.Array, Light, jax.Array, jax.Array] | None,
-    still: tuple[jax.Array, jax.Array, jax.Array] | None,
-    config: RenderConfig,
-    background: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """Picture of a frame in [0, 1], and the greatest stretch of each splat relative to rest.
-
-    Args:
-        gaussians: at rest.
-        splats: posed.
-        camera: of the frame.
-        shade: arguments of `cast_shadows` after the splats; None: no light, and nothing of it is traced.
-        still: picture of the splats that never move, which splats move, and whether all tiles are drawn, of
-            `render_over`; None: the camera moves or a light shines, and the whole picture is drawn.
-        config: of the renderer.
-        background: colour behind the splats.
-    """
-    if shade is not None:
-        splats = cast_shadows(splats, *shade)
-    if still is None:
-        rgb = render(splats, camera, config, background=background, outputs=("rgb",)).rgb
-        assert rgb is not None
-    else:
-        picture, moving, everywhere = still
-        rgb = render_over(picture, splats, moving, camera, config, background=background, everywhere=everywhere)
-    longest = safe_norm(splats.factors, axis=1) / jnp.exp(gaussians.log_scales)  # of each axis
-    return jnp.clip(rgb, 0, 1), longest.max(1)
-
-
-def _moving(scene: Scene, inputs: Inputs, labels: Labels) -> np.ndarray:
-    """Which Gaussians belong to objects that move [n]."""
-    return np.isin(np.asarray(labels.object_id), [inputs.ids[n] for n, e in scene.objects.items() if not e.fixed])
-
-
-class _Pictures(NamedTuple):
-    """The cameras of all frames, and the program that poses and renders one, compiled beside the simulation."""
-
-    cameras: Camera
-    program: Future[Any]  # (gaussians, particles, binding, camera, shade, still): picture, stretch of each splat
-    lit: Callable[..., jax.Array] | None  # (gaussians, particles, binding, casts, light): transmittance
-    shade: tuple[jax.Array, Light, jax.Array, jax.Array] | None  # of `shaded_picture`, at rest
-    still: tuple[jax.Array, jax.Array, jax.Array] | None  # of `shaded_picture`, before the still picture is drawn
-
-    @classmethod
-    def of(cls, scene: Scene, inputs: Inputs, plan: Plan) -> _Pictures:
-        """Begin to compile."""
-        matter = np.asarray(plan.particles.x)
-        cameras = make_cameras(scene, inputs, matter.mean(0), matter)
-        background, config = jnp.asarray(scene.camera.background), render_config(scene)
-        lit, shade = None, None
-        if scene.light is not None:
-            ones = jnp.ones(len(inputs.gaussians), inputs.gaussians.means.dtype)
-            shade = jnp.asarray(_moving(scene, inputs, plan.labels)), scene.light.to_light(), ones, ones
-
-            @jax.jit
-            def lit(gaussians: Gaussians, particles: Particles, binding: Any, *lights: Any) -> jax.Array:
-                splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
-                return light_transmittance(splats, *lights)
-
-        still = None
-        if scene.light is None and all(bool((leaf == leaf[:1]).all()) for leaf in jax.tree.leaves(cameras)):
-            nothing = jnp.zeros((cameras.height, cameras.width, 3), inputs.gaussians.means.dtype)
-            moving = carried_gaussians(inputs.gaussians, plan.particles, plan.binding)
-            still = nothing, moving, jnp.asarray(True)
-
-        # everything large comes in as an argument: XLA would fold constants for minutes
-        @jax.jit
-        def pose_and_render(
-            gaussians: Gaussians, particles: Particles, binding: Any, camera: Camera, shade: Any, still: Any
-        ):  # fmt: skip
-            splats = deform(gaussians, particles, plan.clamp, mode=scene.clamp.mode, binding=binding)
-            return shaded_picture(gaussians, splats, camera, shade, still, config, background)
-
-        traced = pose_and_render.lower(inputs.gaussians, plan.particles, plan.binding, cameras[0], shade, still)
-        compiler = ThreadPoolExecutor(1)
-        program = compiler.submit(traced.compile)
-        compiler.shutdown(wait=False)
-        return cls(cameras, program, lit, shade, still)
-
-
-def _draw(
-    scene: Scene,
-    inputs: Inputs,
-    plan: Plan,
-    labels: Labels,
-    drawn: _Pictures,
-    out: Path,
-    key: str,
-    report: RunReport,
-    tell: Progress,
-    states: Iterator[int],
-    surfaces: Surfaces | None,
-) -> None:
-    """Pose and render each saved state, once `states` says that it is there; remove it where it is not to be kept."""
-    frames, gaussians = scene.simulation.frames, inputs.gaussians
-    cameras, at_rest, still = drawn.cameras, None, drawn.still
-    moving = _moving(scene, inputs, labels)
-
-    def draw(frame: int) -> tuple[jax.Array, jax.Array]:
-        nonlocal at_rest, still
-        state = io.load_state(out / "states", frame, signature=key)
-        there = tuple(np.asarray(state[name], plan.particles.x.dtype) for name in ("x", "F_visual"))
-        particles = eqx.tree_at(lambda p: (p.x, p.F_visual), plan.particles, there)
-        shown, particles = (gaussians, particles) if surfaces is None else surfaces(gaussians, particles)
-        shade = drawn.shade
-        if shade is not None and drawn.lit is not None:
-            reached = drawn.lit(shown, particles, plan.binding, *shade[:2])
-            at_rest = reached if at_rest is None else at_rest  # the first frame that is drawn is the rest state
-            shade = *shade[:2], reached, at_rest
-        if still is not None and bool(still[2]):  # drawn once, by the same program, without what moves
-            hidden = jnp.where(still[1], _UNSEEN, shown.logit_opacities)
-            alone = eqx.tree_at(lambda g: g.logit_opacities, shown, hidden)
-            picture, _ = program()(alone, particles, plan.binding, cameras[frame], shade, still)
-            still = jnp.asarray(np.asarray(picture)), still[1], jnp.asarray(False)  # on one device, as compiled for
-        return program()(shown, particles, plan.binding, cameras[frame], shade, still)
-
-    def program() -> Any:
-        """The compiled program; time spent waiting for it counts as compiling."""
-        begun = time.perf_counter()
-        compiled = drawn.program.result()
-        report.times["draw"].compile += time.perf_counter() - begun
-        return compiled
-
-    sheet_frames = np.unique(np.linspace(0, frames, _SHEET_FRAMES).round().astype(int))
-    sheet: list[np.ndarray] = []
-    stretches: dict[str, list[float]] = {"median": [], "99 of 100 below": [], "most": []}
-
-    every, within = scene.output.states_every, report.times["draw"]
-
-    def wait_for(frame: int, there: int) -> int:
-        """Simulate until the state of a frame is there; `there` is the last one so far."""
-        with report.stage("simulate"):
-            before = replace(report.times["simulate"])
-            while there < frame and (now := next(states, None)) is not None:
-                there = now
-        spent = report.times["simulate"]
-        within.total -= spent.total - before.total  # simulating is no part of drawing
-        within.compile -= spent.compile - before.compile
-        return there
-
-    def pictures() -> Iterator[np.ndarray]:
-        there = frames if every == 1 else -1
-        for frame in range(frames + 1):
-            there = there if there >= frame else wait_for(frame, there)
-            tell("draw", frame, frames + 1)
-            picture, stretch = map(np.asarray, draw(frame))
-            record = np.quantile(stretch[moving], (0.5, 0.99, 1)) if moving.any() else np.ones(3)
-            for values, number in zip(stretches.values(), record.tolist()):
-                values.append(number)
-            if not every or (frame % every and frame < frames):
-                io.remove_state(out / "states", frame)
-            if frame in sheet_frames:
-                sheet.append(picture)
-            yield picture
-
-    io.write_video(out / "video.mp4", pictures(), fps=scene.simulation.fps)
-    tell("draw", frames + 1, frames + 1)
-    wait_for(frames + 1, frames)  # for the health of the whole simulation
-    if not every:
-        for name in ("last.ckpt", io.ROWS):
-            io.remove(out / "states" / name)
-    report.health["splat_stretch"] = stretches
-    report.sheet = io.contact_sheet(sheet)
-    io.write_image(out / "contact_sheet.png", report.sheet)
-    _draw_objects(inputs, labels, cameras[0], sheet[0], out / "objects.png")
-    for name in (*_FILES, "states"):
-        report.files[name.split(".")[0]] = str(out / name)
-
-
-def _draw_objects(inputs: Inputs, labels: Labels, camera: Camera, image: np.ndarray, path: Path) -> None:
-    """The first frame with its objects tinted, and the legend below."""
-    ids, _ = pixel_ids(inputs.gaussians, labels, camera)
-    names = {number: name for name, number in inputs.ids.items()}
-    tinted = overlay(image, ids)
-    legend = legend_sheet(names, image=image, ids=ids, width=tinted.shape[1])
-    io.write_image(path, np.concatenate([tinted, legend]))

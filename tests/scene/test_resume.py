@@ -140,7 +140,7 @@ def test_what_is_only_drawn_simulates_nothing(folder, finished, reached, section
     ((name, values),) = section.items()
     scene = scene_from({**THROW, name: {**THROW.get(name, {}), **values}}, folder=folder)
     monkeypatch.setattr(run_module.ActiveGrid, "frame", None)
-    reached(run_module, "_draw")
+    reached(run_module, "draw_run")
     with pytest.raises(Reached):
         run_scene(scene, finished)
 
@@ -175,7 +175,7 @@ def test_damaged_runs_end_with_the_same_bits(folder, finished, tmp_path, monkeyp
     out = tmp_path / "out"
     shutil.copytree(finished, out)
     DAMAGES[case](out / "states")
-    monkeypatch.setattr(run_module, "_draw", lambda *_: None)
+    monkeypatch.setattr(run_module, "draw_run", lambda *_: None)
     report = run_scene(scene_from(THROW, folder=folder), out)
     assert_same_states(out, finished)
     assert case in SILENT or json.loads((out / "report.json").read_text())["warnings"], report.warnings
@@ -196,7 +196,7 @@ run_scene(load_scene(Path(sys.argv[1]) / "scene.toml"), sys.argv[2], progress=te
     command = [sys.executable, "-c", script, folder, tmp_path, at]
     done = subprocess.run(command, capture_output=True, env=same_code)
     assert done.returncode == -signal.SIGKILL, done.stderr
-    monkeypatch.setattr(run_module, "_draw", lambda *_: None)
+    monkeypatch.setattr(run_module, "draw_run", lambda *_: None)
     run_scene(scene_from(THROW, folder=folder), tmp_path)
     assert_same_states(tmp_path, finished)
 
