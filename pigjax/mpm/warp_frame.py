@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 from pigjax.core.errors import InputError
 from pigjax.mpm import WALL, State, StepHealth
 from pigjax.mpm.boundaries import places_of
+from pigjax.mpm.by_law import parameters_of
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.config import SimConfig
 from pigjax.mpm.frame_kernels import FrameKernels, frame_kernels
@@ -39,7 +40,7 @@ from pigjax.mpm.frame_types import (
     STICKY,
     V,
 )
-from pigjax.mpm.substep import StepContext, StepStatics, between_walls, parameters_of
+from pigjax.mpm.substep import StepContext, StepStatics, between_walls
 
 LAWS = {"fixed_corotated": FIXED_COROTATED, "neo_hookean": NEO_HOOKEAN}  # that the kernels know
 _MODES = {"separate": SEPARATE, "slip": SLIP, "sticky": STICKY}

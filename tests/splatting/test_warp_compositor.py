@@ -117,8 +117,9 @@ def test_many_cameras_are_one_launch(x64):
 
 
 @needs_warp
-def test_lists_are_those_of_xla(x64):
-    splats = scene(120, extreme=True)
+@pytest.mark.parametrize(("slots", "least"), [(400, 100), (9, 2)], ids=["extreme", "fewer slots than tiles"])
+def test_lists_are_those_of_xla(x64, slots, least):
+    splats = scene(120, extreme=least == 100)
 
     @functools.partial(jax.jit, static_argnums=1)
     def lists(splats, backend):
@@ -127,11 +128,11 @@ def test_lists_are_those_of_xla(x64):
         blending = blend_config(CAMERA, config, len(splats), surface=False)
         boxes = bin_splats(projected, blending)
         is_open = jnp.arange(blending.tiles) % 3 > 0
-        return list_pass(projected.shapes[boxes.order], boxes, 5, is_open, blending, 400)
+        return list_pass(projected.shapes[boxes.order], boxes, 6, is_open, blending, slots)
 
     ours, oracle = lists(splats, "warp"), lists(splats, "xla")
     owned = int(oracle.start[-1])
-    assert owned > 100
+    assert owned >= least
     np.testing.assert_array_equal(ours.start, oracle.start)
     for name in ("rank", "tile"):
         np.testing.assert_array_equal(getattr(ours, name)[:owned], getattr(oracle, name)[:owned])
@@ -139,16 +140,19 @@ def test_lists_are_those_of_xla(x64):
 
 
 @needs_warp
-def test_credits_are_those_of_xla(x64):
+@pytest.mark.parametrize("config", [{}, {"tile_size": 8, "capacity": 4}], ids=["", "a capacity below the 20 tiles"])
+def test_credits_are_those_of_xla(x64, config):
     splats, rng = scene(60), np.random.default_rng(4)
     mask = jnp.asarray(rng.integers(0, 4, (CAMERA.height, CAMERA.width)))
     candidates = jnp.asarray(rng.integers(-1, 4, (60, 2)))
 
     @functools.partial(jax.jit, static_argnums=0)
     def credits(backend):
-        return credits_of_candidates(splats, CAMERA, RenderConfig(backend=backend), mask, candidates)
+        return credits_of_candidates(splats, CAMERA, RenderConfig(backend=backend, **config), mask, candidates)
 
-    check_equal(credits("warp"), credits("xla"), 1e-10)
+    oracle = credits("xla")
+    assert float(oracle.max()) > 0
+    check_equal(credits("warp"), oracle, 1e-10)
 
 
 @pytest.mark.parametrize("backend", ["auto", "xla", pytest.param("warp", marks=needs_warp)])
@@ -209,6 +213,19 @@ def test_lists_of_three_images_are_sorted_together(monkeypatch, at_once):
     for own, other, owned in zip(ours.rank, oracle.rank, oracle.start[:, -1]):
         assert owned > 30
         np.testing.assert_array_equal(own[:owned], other[:owned])
+
+
+@needs_warp
+def test_a_pass_on_a_cuda_device_holds_more_pairs_of_a_splat(monkeypatch):
+    camera = look_at((0, -3, 0), (0, 0, 0), up=(0, 0, 1), focal=1000.0, width=1920, height=1080)
+
+    def slots(count, **config):
+        return blend_config(camera, RenderConfig(backend="warp", **config), count, surface=False).slots
+
+    assert (slots(10_000), slots(1_000_000)) == (60_000, 2**17)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert (slots(10_000), slots(1_000_000)) == (160_000, 16_000_000)
+    assert (slots(4_000_000), slots(1_000_000, slots=9_000), slots(10_000, capacity=9_000)) == (2**24, 9_000, 9_000)
 
 
 def test_warp_asked_for_in_forward_mode_is_refused():
