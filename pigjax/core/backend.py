@@ -119,6 +119,11 @@ def import_warp() -> Any:
     return warp
 
 
+def native(snippet: str, single: bool) -> str:
+    """A snippet of C++ with SCALAR and FLOAT replaced by the type of a precision and by whether that is float32."""
+    return snippet.replace("SCALAR", "float" if single else "double").replace("FLOAT", str(int(single)))
+
+
 def launcher(kernel: Any, name: str, outputs: int, in_out: tuple[str, ...] = ()) -> Any:
     """A Warp kernel as a function of JAX arrays, launched on the axes of its first array.
 

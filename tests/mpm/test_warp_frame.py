@@ -248,6 +248,38 @@ def test_laws_and_their_adjoints_are_those_of_xla_for_any_deformation(x64):
             np.testing.assert_allclose(own, other, rtol=1e-7, atol=1e-7, err_msg=name)
 
 
+@needs_warp
+def test_blocks_of_steps_are_as_long_for_many_particles_as_for_few():
+    """So that reverse mode keeps the root of the steps, as `adjoint.run_steps`, where a state takes 2 GiB."""
+    count = 15_000_000
+    table = material_table([Material("neo_hookean", density=1000.0, young=1e5, poisson=0.3)])
+    settings = SimConfig(substeps=40, devices=1, backend="warp", whole_frames=True)
+
+    def height(v):
+        particles = make_particles(v, velocity=v, volume=1e-4, table=table)
+        return rollout(particles, GRID, table, settings, frames=1, frame_dt=1e-3, gravity=(0.0, 0.0, -9.8))[0].x.sum()
+
+    program = str(jax.make_jaxpr(jax.grad(height))(jax.ShapeDtypeStruct((count, 3), jnp.float32)))
+    assert f"[1,5,38,{count}]" in program  # the states before 5 blocks
+    assert f"[1,9,38,{count}]" in program  # and those of the 8 steps of one
+
+
+@needs_warp
+def test_a_state_may_take_more_than_strides_of_warp_hold():
+    """Its strides have 32 bits; the memory of zeros is taken page by page, so that little of it is touched."""
+    from pigjax.mpm.frame_kernels import frame_kernels
+    from pigjax.mpm.frame_types import ROWS
+
+    warp = pytest.importorskip("warp")
+    copy = next(kernel for kernel in frame_kernels(3, True).kernels if "copy" in kernel.key)
+    states = np.zeros((1, 2, ROWS, 2**31 // (4 * ROWS) + 8), np.float32)
+    states[0, 0, :, -3:] = np.arange(3 * ROWS).reshape(ROWS, 3) + 1
+    particles = states.shape[-1]
+    array = warp.array(ptr=states[:, :, :, particles - 3 :].ctypes.data, dtype=float, shape=states.shape, device="cpu")
+    warp.launch(copy, (1, ROWS, 3), [array, 0, array, 1], device="cpu")
+    np.testing.assert_array_equal(states[0, 1, :, -3:], states[0, 0, :, -3:])
+
+
 def test_scenes_that_do_not_qualify_are_told_why_or_take_the_transfers():
     field = ForceField(acceleration=(1.0, 0.0, 0.0))
     moving = Plane(point=jnp.zeros(3), normal=jnp.asarray([0.0, 0.0, 1.0]), velocity=jnp.ones(3))

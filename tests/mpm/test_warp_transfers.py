@@ -73,6 +73,34 @@ def test_transfers_and_their_adjoints_are_those_of_xla(x64, kernel):
 
 
 @needs_warp
+def test_a_simulation_of_a_batch_may_take_more_than_strides_of_warp_hold():
+    """Its strides have 32 bits; the memory of zeros is taken page by page, so that little of it is touched."""
+    from pigjax.mpm.warp_kernels import transfer_kernels
+
+    warp = pytest.importorskip("warp")
+    shape = (2, 9, 8, 2**31 // (16 * 72) + 8)  # nodes of two simulations
+    grid, total = np.zeros((*shape, 4), np.float32), np.zeros((*shape, 4), np.float32)
+    grid[1, :3, :3, :3] = 1.0
+    start = np.zeros((2, np.prod(shape[1:]) + 1), np.int32)
+    start[1, 1:100], order, cells = (
+        1,
+        np.zeros((2, 1), np.int32),
+        np.zeros((2, 1, 3), np.float32),
+    )  # one at node 0, 0, 0
+    moments = [np.ones((2, 1, 4), np.float32) for _ in range(4)]
+    vec3, vec4 = warp.vec3, warp.vec4
+    kinds = [vec4, *[vec4] * 4, vec3, warp.int32, warp.int32, vec4]
+    arrays = [
+        warp.array(ptr=own.ctypes.data, dtype=kind, shape=own.shape[: 4 if own.ndim == 5 else 2], device="cpu")
+        for own, kind in zip((grid, *moments, cells, order, start, total), kinds)
+    ]
+    kernel = transfer_kernels(3, True, True).scatter_in_order.kernel
+    warp.launch(kernel, (2, 2, 2, 2), arrays, device="cpu")
+    np.testing.assert_allclose(total[1, 0, 0, 0], 1 + 0.75**3, rtol=1e-6)
+    assert not total[0, :2, :2, :2].any()
+
+
+@needs_warp
 @pytest.mark.parametrize("count", [0, 1])
 def test_no_particle_and_one(x64, count):
     from pigjax.mpm.warp_transfers import add_to_grid, take_from_grid

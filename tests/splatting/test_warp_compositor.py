@@ -216,6 +216,32 @@ def test_lists_of_three_images_are_sorted_together(monkeypatch, at_once):
 
 
 @needs_warp
+def test_planes_of_an_image_may_take_more_than_strides_of_warp_hold():
+    """Its strides have 32 bits; the memory of zeros is taken page by page, so that little of it is touched."""
+    from pigjax.splatting.warp_kernels import blend_kernels
+
+    warp, pixels = pytest.importorskip("warp"), 2**31 // 16 + 8
+    numbers = {
+        "through": np.zeros((2, 1, pixels), np.float32), "planes": np.zeros((2, 1, 1, pixels, 4), np.float32),
+        "surface": np.zeros((2, 1, pixels), np.float32), "rows": np.ones((2, 1, 3, 4), np.float32),
+        "rank": np.zeros((2, 1), np.int32), "start": np.array([[0, 0], [0, 1]], np.int32),
+        "limits": np.array([[0.0, 0.5, 0.0, 0.0]] * 2, np.float32), "sizes": np.array([[1, 16]] * 2, np.int32),
+    }  # fmt: skip
+    numbers["through"][1, 0, 0] = 1.0
+    wide = {"planes", "rows", "limits"}
+    arrays = [
+        warp.array(
+            ptr=own.ctypes.data, dtype=warp.vec4 if name in wide else float if own.dtype == np.float32 else warp.int32,
+            shape=own.shape[: own.ndim - (name in wide)], device="cpu",
+        )
+        for name, own in numbers.items()
+    ]  # fmt: skip
+    warp.launch(blend_kernels(1, True).forward.kernel, (2, 1, 1), arrays, device="cpu")
+    np.testing.assert_array_equal(numbers["planes"][1, 0, 0, 0], 0.5)  # alpha at its clamp, of a splat of colour 1
+    assert not numbers["planes"][0, 0, 0, :9].any()
+
+
+@needs_warp
 def test_a_pass_on_a_cuda_device_holds_more_pairs_of_a_splat(monkeypatch):
     camera = look_at((0, -3, 0), (0, 0, 0), up=(0, 0, 1), focal=1000.0, width=1920, height=1080)
 
