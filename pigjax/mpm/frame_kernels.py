@@ -255,10 +255,14 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
             of_rate += dt * (of_f * wp.transpose(f_before))
             of_dt = wp.ddot(of_f, rate * f_before)
             of_f += dt * (wp.transpose(rate) * of_f)
-            held = vector(state, b, after, wp.static(CELLS), p)
+            cell = before + (dt / dx * v - vector(state, b, slot, wp.static(ROUNDED), p))  # before the grid held it
             for i in range(3):
-                if held[i] <= real(1.0) or held[i] >= size[i] - real(2.0):
-                    of_cell[i] = real(0.0)
+                passed = real(1.0)
+                if cell[i] <= real(1.0) or cell[i] >= size[i] - real(2.0):
+                    passed = real(0.0)
+                    if cell[i] == real(1.0) or cell[i] == size[i] - real(2.0):
+                        passed = real(0.5)  # as `jnp.clip`
+                of_cell[i] = passed * of_cell[i]
             along = wp.dot(of_cell, v) / dx
             of_v += (dt / dx) * of_cell
             of_dt += along
