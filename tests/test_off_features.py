@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import equations
 from scenes import ball
 
 from pigjax.core.camera import look_at
@@ -73,17 +74,6 @@ def traced(materials=None, *, colliders=(), contact=None, pins=(), forces=(), kn
 def text(program):
     """The program, without the addresses of functions."""
     return re.sub(r"0x[0-9a-f]+", "", str(program))
-
-
-def equations(jaxpr):
-    """All of them, nested ones included."""
-    for equation in jaxpr.eqns:
-        yield equation
-        for value in equation.params.values():
-            for inner in value if isinstance(value, tuple | list) else [value]:
-                inner = getattr(inner, "jaxpr", inner)
-                if hasattr(inner, "eqns"):
-                    yield from equations(inner)
 
 
 def primitives(program):

@@ -16,6 +16,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.custom_batching import custom_vmap
 
 from pigjax.core.errors import InputError
@@ -72,21 +73,24 @@ def takes_warp(choice: str, differentiation: str) -> bool:
     return True
 
 
-def check_order(warp: bool) -> None:
+def check_order(warp: bool, implicit: bool) -> None:
     """Refuse sums in a fixed order where XLA adds in any.
 
     Args:
-        warp: whether the sums are Warp kernels, which have a fixed order if asked for.
+        warp: whether P2G and G2P are Warp kernels, which have a fixed order if asked for.
+        implicit: whether steps are implicit: XLA sums the forces of their solves on either backend.
 
     Raises:
         InputError: XLA scatters by atomics on the default device.
     """
     flags = os.environ.get("XLA_FLAGS", "")
-    if not warp and jax.default_backend() == "gpu" and not any(flag in flags for flag in _ORDERED):
-        raise InputError(
-            "SimConfig.deterministic = True: XLA adds in any order on a GPU; take backend = 'warp', or set"
-            f" XLA_FLAGS={_ORDERED[0]}=true before JAX starts."
-        )
+    if (warp and not implicit) or jax.default_backend() != "gpu" or any(flag in flags for flag in _ORDERED):
+        return
+    remedy = "integrator = 'explicit' with backend = 'warp'" if implicit else "backend = 'warp'"
+    raise InputError(
+        f"SimConfig.deterministic = True: XLA adds in any order on a GPU; take {remedy}, or set"
+        f" XLA_FLAGS={_ORDERED[0]}=true before JAX starts."
+    )
 
 
 def backend_in_use() -> str:
@@ -113,6 +117,11 @@ def import_warp() -> Any:
     if ours:
         warp.config.log_level = warp.LOG_WARNING
     return warp
+
+
+def native(snippet: str, single: bool) -> str:
+    """A snippet of C++ with SCALAR and FLOAT replaced by the type of a precision and by whether that is float32."""
+    return snippet.replace("SCALAR", "float" if single else "double").replace("FLOAT", str(int(single)))
 
 
 def launcher(kernel: Any, name: str, outputs: int, in_out: tuple[str, ...] = ()) -> Any:
@@ -153,26 +162,38 @@ def caller(function: Any, name: str, outputs: int, in_out: tuple[str, ...] = (),
         outputs: as of `launcher`.
         in_out: as of `launcher`.
         graph_of: the kernels that it launches, if it neither allocates nor waits for the device: a CUDA device then
-            plays its launches back as one graph.
+            plays its launches back as one graph. Where JAX has such a device, the graph is chosen when the program is
+            lowered for the device of its data, which may be the CPU.
     """
     warp = import_warp()
-    function.__qualname__ = f"pigjax_{name}"
     modes = warp.JaxCallableGraphMode
 
     @functools.cache
     def call_by(mode: Any) -> Any:
+        # a name for each mode, so that neither depends on which mode was taken first
+        function.__qualname__ = f"pigjax_{name}" + "_graph" * (mode == modes.WARP)
         return warp.jax_callable(function, num_outputs=outputs, graph_mode=mode, in_out_argnames=list(in_out))
 
     def run(*arrays: Any, output_dims: Mapping[str, tuple[int, ...]] | None = None) -> Any:
         @custom_vmap
         def one(*arrays: Any) -> Any:
-            graphs = bool(graph_of) and _is_cuda()
-            call = call_by(modes.WARP if graphs else modes.NONE)
-            call.call_id = _number_of([array.shape for array in arrays], sorted((output_dims or {}).items()))
-            for kernel in graph_of if graphs else ():  # no module may be loaded while a graph is recorded
-                for device in jax.local_devices():
+            number = _number_of([array.shape for array in arrays], sorted((output_dims or {}).items()))
+
+            def by(mode: Any) -> Any:
+                def called(*arrays: Any) -> Any:
+                    call = call_by(mode)
+                    call.call_id = number
+                    return tuple(call(*arrays, output_dims=output_dims))
+
+                return called
+
+            devices = _cuda_devices() if graph_of else ()
+            if not devices:
+                return by(modes.NONE)(*arrays)
+            for kernel in graph_of:  # no module may be loaded while a graph is recorded
+                for device in devices:
                     kernel.module.load(warp.device_from_jax(device))
-            return tuple(call(*arrays, output_dims=output_dims))
+            return lax.platform_dependent(*arrays, cpu=by(modes.NONE), cuda=by(modes.WARP))
 
         @one.def_vmap
         def several(size: int, mapped: Any, *arrays: Any) -> Any:
@@ -227,6 +248,15 @@ def _device() -> jax.Device:
 
 
 def _is_cuda() -> bool:
-    """Whether JAX's default device is one of NVIDIA's; AMD's are of platform "gpu" too."""
-    device = _device()
+    """Whether JAX's default device is one of NVIDIA's."""
+    return _is_of_nvidia(_device())
+
+
+def _cuda_devices() -> list[jax.Device]:
+    """Devices of NVIDIA's on which data may be, whatever the default one is."""
+    return [device for device in {*jax.local_devices(), _device()} if _is_of_nvidia(device)]
+
+
+def _is_of_nvidia(device: jax.Device) -> bool:
+    """AMD's devices are of platform "gpu" too."""
     return device.platform == "gpu" and "cuda" in device.client.platform_version.lower()

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Num
 
 from pigjax.core import linalg
 from pigjax.core.errors import InputError
@@ -70,7 +70,7 @@ class Grouping(NamedTuple):
     def _merge(self, pieces: Sequence[Array], axis: int = 0) -> Array:
         """Arrays of the laws as one, in the user's order along an axis."""
         merged = jnp.concatenate(pieces, axis)
-        return merged if self.order is None else jnp.take(merged, inverse(self.order), axis)
+        return merged if self.order is None else jnp.take(merged, inverse(self.order), axis, unique_indices=True)
 
 
 def group_by_law(
@@ -114,6 +114,12 @@ def group_by_law(
     still = next((part for part, moving in zip(parts, moves) if not moving), None)
     groups, states = tuple(group for group, _ in pairs), tuple(state for _, state in pairs)
     return Grouping(groups, states, still, parts, moves, order, apart)
+
+
+def parameters_of(parameters: Parameters, row: Num[Array, "c"]) -> Parameters:
+    """Parameters of each particle [c] from those of each material [m]; a sum whose transpose needs no scatter."""
+    count = len(jax.tree.leaves(parameters)[0])
+    return jax.tree.map(lambda p: sum(jnp.where(row == k, p[k], 0) for k in range(count)), parameters)
 
 
 def by_component(rows: Array) -> Array:
@@ -184,7 +190,7 @@ def _group(
     ok = _finite((given, part.x)) & (part.mass >= 0) & (part.volume0 > 0)
     state = sound(given, ok)
     F, rate = by_component(state.F.T), by_component(state.C.T)
-    of_each = jax.tree.map(lambda p: p[own_row], parameters) if several else parameters
+    of_each = parameters_of(parameters, own_row) if several else parameters
     inner = state.hardening[:, 0] if kind.hardens else None
     F, inner, stress = respond(law, F, rate, 0.0, inner, of_each)
     inner = state.hardening if inner is None else inner[:, None]

@@ -19,8 +19,9 @@ from pigjax.mpm.frame_types import DT, GRAVITY, NUMBERS, SEPARATE, SLIP, STICKY,
 def grid_kernels(single: bool) -> tuple[Any, Any]:
     """The kernels `update` and `update_adjoint`, in float32, else in float64."""
     wp, types = import_warp(), frame_types(single)
-    real, vec3, vec4, kernel, read, four = (
-        types.real, types.vec3, types.vec4, types.kernel, types.read, types.four
+    real, vec3, vec4, kernel, read, write, four, number, vector, put_number, put_vector, add_entry = (
+        types.real, types.vec3, types.vec4, types.kernel, types.read, types.write, types.four, types.number,
+        types.vector, types.put_number, types.put_vector, types.add_entry,
     )  # fmt: skip
     nodes_array, rows_array, reals2, reals3, whole2 = (
         types.nodes, types.rows, types.reals2, types.reals3, types.whole2
@@ -52,9 +53,9 @@ def grid_kernels(single: bool) -> tuple[Any, Any]:
         """Velocity after the first `count` colliders."""
         out = v
         for c in range(count):
-            share = contact[b, c, 3, n]
+            share = number(contact, b, c, 3, n)
             if share > real(0.0):
-                normal = vec3(contact[b, c, 0, n], contact[b, c, 1, n], contact[b, c, 2, n])
+                normal = vector(contact, b, c, 0, n)
                 free = touched(modes[b, c], normal, numbers[b, wp.static(NUMBERS) + c], out)
                 if share < real(1.0):
                     free = out + share * (free - out)
@@ -108,18 +109,19 @@ def grid_kernels(single: bool) -> tuple[Any, Any]:
             x, y, z = walls_x[b, n // (ny * nz)], walls_y[b, (n // nz) % ny], walls_z[b, n % nz]
             share = through_walls(modes[b, count], x, y, z, v)
             out = vec4(share[0] * v[0], share[1] * v[1], share[2] * v[2], real(0.0))
-        velocity[b, 0, n] = out
+        write(velocity, wp.int64(b) * wp.int64(velocity.shape[2]) + wp.int64(n), out)
         if clear == 1:
-            grid[b, slot, n] = vec4()
+            write(grid, own, vec4())
 
     @kernel
     def update_adjoint(
         grid: nodes_array, slot: int, numbers: reals2, modes: whole2, walls_x: whole2, walls_y: whole2,
-        walls_z: whole2, contact: rows_array, cotangent: nodes_array, of_gravity: wp.array2d(dtype=vec4),
+        walls_z: whole2, contact: rows_array, cotangent: nodes_array, of_gravity: nodes_array,
         of_contact: rows_array, of_friction: reals3,
     ):  # fmt: skip
         b, n = wp.tid()
         own = (wp.int64(b) * wp.int64(grid.shape[1]) + wp.int64(slot)) * wp.int64(grid.shape[2]) + wp.int64(n)
+        single = wp.int64(b) * wp.int64(cotangent.shape[2]) + wp.int64(n)  # where an array has one slot
         q, unit = read(grid, own), numbers[b, wp.static(UNIT_MASS)]
         mass, out = q[0] / unit, vec4()
         if mass > real(wp.static(least_mass)):
@@ -129,14 +131,14 @@ def grid_kernels(single: bool) -> tuple[Any, Any]:
             v = after_contact(contact, numbers, modes, count, b, n, free)
             nz, ny = walls_z.shape[1], walls_y.shape[1]
             x, y, z = walls_x[b, n // (ny * nz)], walls_y[b, (n // nz) % ny], walls_z[b, n % nz]
-            share, given = through_walls(modes[b, count], x, y, z, v), cotangent[b, 0, n]
+            share, given = through_walls(modes[b, count], x, y, z, v), read(cotangent, single)
             of_v = vec3(share[0] * given[0], share[1] * given[1], share[2] * given[2])
             for back in range(count):
                 c = count - 1 - back
-                weight = contact[b, c, 3, n]
+                weight = number(contact, b, c, 3, n)
                 if weight > real(0.0):
                     before = after_contact(contact, numbers, modes, c, b, n, free)
-                    normal = vec3(contact[b, c, 0, n], contact[b, c, 1, n], contact[b, c, 2, n])
+                    normal = vector(contact, b, c, 0, n)
                     friction, mode = numbers[b, wp.static(NUMBERS) + c], modes[b, c]
                     of_weight = wp.dot(of_v, touched(mode, normal, friction, before) - before)
                     of_out = weight * of_v
@@ -156,7 +158,7 @@ def grid_kernels(single: bool) -> tuple[Any, Any]:
                                 if glide > real(0.0):
                                     ratio, way = friction * speed / glide, tangential / glide
                                 of_way = wp.dot(of_out, way)
-                                of_friction[b, c, n] += of_way * speed
+                                add_entry(of_friction, b, c, n, of_way * speed)
                                 drag = of_way * friction
                                 of_tangential = (real(1.0) + ratio) * of_out - (of_way * ratio) * way
                                 of_speed = drag - wp.dot(of_tangential, normal)
@@ -164,12 +166,12 @@ def grid_kernels(single: bool) -> tuple[Any, Any]:
                                 of_normal = of_speed * before - speed * of_tangential
                         else:
                             of_before += of_out
-                    for i in range(3):
-                        of_contact[b, c, i, n] += of_normal[i]
-                    of_contact[b, c, 3, n] += of_weight
+                    of_normal += vector(of_contact, b, c, 0, n)
+                    put_vector(of_contact, b, c, 0, n, of_normal)
+                    put_number(of_contact, b, c, 3, n, number(of_contact, b, c, 3, n) + of_weight)
                     of_v = of_before
-            of_gravity[b, n] += vec4(of_v[0], of_v[1], of_v[2], real(0.0))
+            write(of_gravity, single, read(of_gravity, single) + four(real(0.0), of_v))
             out = four(-wp.dot(of_v, momentum) / (mass * mass) / unit, of_v / mass / unit)
-        cotangent[b, 0, n] = out
+        write(cotangent, single, out)
 
     return update, update_adjoint

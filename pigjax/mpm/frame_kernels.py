@@ -14,7 +14,7 @@ Kernels are in Warp's language: annotations are calls, and int(0) declares a var
 import functools
 from typing import Any, NamedTuple, no_type_check
 
-from pigjax.core.backend import caller, import_warp
+from pigjax.core.backend import caller, import_warp, native
 from pigjax.mpm.frame_grid import grid_kernels
 from pigjax.mpm.frame_laws import frame_laws
 from pigjax.mpm.frame_types import (
@@ -35,9 +35,6 @@ from pigjax.mpm.frame_types import (
 )
 from pigjax.mpm.transfers import KERNELS
 from pigjax.mpm.warp_kernels import spline_functions
-
-_LARGEST = 2**31 - 1  # bytes from one item to the next of an axis of Warp's arrays
-
 
 # Atomics on one place wait for each other. So the threads of a warp that belong to one simulation agree first, by
 # whole numbers that are ordered as the reals (compute capability 8.0 on), and a read tells whether an atomic is needed.
@@ -87,8 +84,9 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
     nodes_array, rows_array, reals2, reals3, whole2, whole3 = (
         types.nodes, types.rows, types.reals2, types.reals3, types.whole2, types.whole3
     )  # fmt: skip
-    add, read, vector, tensor, put_vector, put_tensor, column, four = (
-        types.add, types.read, types.vector, types.tensor, types.put_vector, types.put_tensor, types.column, types.four
+    add, read, number, vector, tensor, put_number, put_vector, put_tensor, entry, add_entry, whole, column, four = (
+        types.add, types.read, types.number, types.vector, types.tensor, types.put_number, types.put_vector,
+        types.put_tensor, types.entry, types.add_entry, types.whole, types.column, types.four,
     )  # fmt: skip
     spline = next(kernel for kernel in KERNELS.values() if len(kernel.offsets) == nodes)
     weights, slopes, anchor = spline_functions(nodes, spline.nearest, single)
@@ -108,7 +106,7 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
     @kernel
     def copy(source: rows_array, at: int, target: rows_array, to: int):
         b, row, p = wp.tid()
-        target[b, to, row, p] = source[b, at, row, p]
+        put_number(target, b, to, row, p, number(source, b, at, row, p))
 
     @kernel
     def begin(extrema: reals2):
@@ -116,14 +114,14 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
         extrema[b, 0] = real(wp.static(infinity))
         extrema[b, 1] = real(0.0)
 
-    @wp.func_native(_EXTREMA.replace("SCALAR", real_name).replace("FLOAT", str(int(single))))
+    @wp.func_native(native(_EXTREMA, single))
     def note_extrema(extrema: reals2, b: int, least: real, largest: real): ...
 
     @wp.func
     def affine(state: rows_array, slot: int, numbers: reals2, b: int, p: int):
         """APIC's affine momentum with the impulse of the stress, per cell."""
         dt, dx = numbers[b, wp.static(DT)], numbers[b, wp.static(DX)]
-        m, volume = real(state[b, slot, wp.static(MASS), p]), real(state[b, slot, wp.static(VOLUME), p])
+        m, volume = number(state, b, slot, wp.static(MASS), p), number(state, b, slot, wp.static(VOLUME), p)
         rate, stress = tensor(state, b, slot, wp.static(C), p), tensor(state, b, slot, wp.static(STRESS), p)
         return (dx * m) * rate - (dt * real(wp.static(inertia)) / dx * volume) * stress
 
@@ -138,7 +136,7 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
         x, y, z = anchor(cell[0], walls_x.shape[1]), anchor(cell[1], ny), anchor(cell[2], nz)
         d = cell - vec3(real(x), real(y), real(z))
         wx, wy, wz = weights(d[0]), weights(d[1]), weights(d[2])
-        m, slope = state[b, slot, wp.static(MASS), p], affine(state, slot, numbers, b, p)
+        m, slope = number(state, b, slot, wp.static(MASS), p), affine(state, slot, numbers, b, p)
         momentum = m * vector(state, b, slot, wp.static(V), p) - slope * d
         start = (wp.int64(b) * wp.int64(grid.shape[1]) + wp.int64(to)) * wp.int64(grid.shape[2])
         first = start + wp.int64(((x - 1) * ny + y - 1) * nz + z - 1)
@@ -175,14 +173,14 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
         rate = (kappa / dx) * (slope - wp.outer(v, d))
         f = tensor(state, b, slot, wp.static(F), p)
         f = f + dt * (rate * f)
-        stress = stress_of(law[b, p], f, moduli[b, 0, p], moduli[b, 1, p])
+        stress = stress_of(whole(law, b, p), f, entry(moduli, b, 0, p), entry(moduli, b, 1, p))
         shift = dt / dx * v - vector(state, b, slot, wp.static(ROUNDED), p)
         cell = before + shift
         rounded = (cell - before) - shift
         held = vec3()
         for i in range(3):
             held[i] = wp.clamp(cell[i], real(1.0), size[i] - real(2.0))
-        m, volume = real(state[b, slot, wp.static(MASS), p]), real(state[b, slot, wp.static(VOLUME), p])
+        m, volume = number(state, b, slot, wp.static(MASS), p), number(state, b, slot, wp.static(VOLUME), p)
 
         J, speed, total = wp.determinant(f), wp.dot(v, v), m + volume
         if volume > real(0.0) and not wp.isnan(J) and not wp.isnan(speed):
@@ -218,8 +216,8 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
         put_tensor(state, b, to, wp.static(C), p, rate)
         put_tensor(state, b, to, wp.static(F), p, f)
         put_tensor(state, b, to, wp.static(STRESS), p, stress)
-        state[b, to, wp.static(MASS), p] = m
-        state[b, to, wp.static(VOLUME), p] = volume
+        put_number(state, b, to, wp.static(MASS), p, m)
+        put_number(state, b, to, wp.static(VOLUME), p, volume)
 
     @kernel(**at_least_of_blocks(2))
     def gather_adjoint(
@@ -236,29 +234,35 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
         d = before - vec3(real(x), real(y), real(z))
         wx, wy, wz, sx, sy, sz = weights(d[0]), weights(d[1]), weights(d[2]), slopes(d[0]), slopes(d[1]), slopes(d[2])
         first = wp.int64(b) * wp.int64(velocity.shape[2]) + wp.int64(((x - 1) * ny + y - 1) * nz + z - 1)
-        lost = state[b, slot, wp.static(VOLUME), p] > real(0.0) and state[b, after, wp.static(VOLUME), p] == real(0.0)
+        volume = number(state, b, slot, wp.static(VOLUME), p)
+        lost = volume > real(0.0) and number(state, b, after, wp.static(VOLUME), p) == real(0.0)
         of_cell, of_v = vector(of_state, b, 0, wp.static(CELLS), p), vector(of_state, b, 0, wp.static(V), p)
         of_rate, of_f = tensor(of_state, b, 0, wp.static(C), p), tensor(of_state, b, 0, wp.static(F), p)
         if lost:
             put_vector(of_state, b, 0, wp.static(CELLS), p, vec3())
             put_tensor(of_state, b, 0, wp.static(F), p, mat33())
-            of_state[b, 0, wp.static(MASS), p] = real(0.0)
-            of_state[b, 0, wp.static(VOLUME), p] = real(0.0)
+            put_number(of_state, b, 0, wp.static(MASS), p, real(0.0))
+            put_number(of_state, b, 0, wp.static(VOLUME), p, real(0.0))
         else:
             f, f_before = tensor(state, b, after, wp.static(F), p), tensor(state, b, slot, wp.static(F), p)
             rate, v = tensor(state, b, after, wp.static(C), p), vector(state, b, after, wp.static(V), p)
             of_stress = tensor(of_state, b, 0, wp.static(STRESS), p)
-            by_f, of_mu, of_lam = stress_adjoint(law[b, p], f, moduli[b, 0, p], moduli[b, 1, p], of_stress)
-            of_moduli[b, 0, p] += of_mu
-            of_moduli[b, 1, p] += of_lam
+            mu, lam = entry(moduli, b, 0, p), entry(moduli, b, 1, p)
+            by_f, of_mu, of_lam = stress_adjoint(whole(law, b, p), f, mu, lam, of_stress)
+            add_entry(of_moduli, b, 0, p, of_mu)
+            add_entry(of_moduli, b, 1, p, of_lam)
             of_f += by_f
             of_rate += dt * (of_f * wp.transpose(f_before))
             of_dt = wp.ddot(of_f, rate * f_before)
             of_f += dt * (wp.transpose(rate) * of_f)
-            held = vector(state, b, after, wp.static(CELLS), p)
+            cell = before + (dt / dx * v - vector(state, b, slot, wp.static(ROUNDED), p))  # before the grid held it
             for i in range(3):
-                if held[i] <= real(1.0) or held[i] >= size[i] - real(2.0):
-                    of_cell[i] = real(0.0)
+                passed = real(1.0)
+                if cell[i] <= real(1.0) or cell[i] >= size[i] - real(2.0):
+                    passed = real(0.0)
+                    if cell[i] == real(1.0) or cell[i] == size[i] - real(2.0):
+                        passed = real(0.5)  # as `jnp.clip`
+                of_cell[i] = passed * of_cell[i]
             along = wp.dot(of_cell, v) / dx
             of_v += (dt / dx) * of_cell
             of_dt += along
@@ -266,8 +270,8 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
             by_moment = (kappa / dx) * of_rate
             of_v -= by_moment * d
             of_cell -= wp.transpose(by_moment) * v
-            of_sizes[b, 0, p] += of_dt
-            of_sizes[b, 1, p] += of_dx
+            add_entry(of_sizes, b, 0, p, of_dt)
+            add_entry(of_sizes, b, 1, p, of_dx)
             for i in range(wp.static(nodes)):
                 for j in range(wp.static(nodes)):
                     at_xy = of_v + real(i - 1) * column(by_moment, 0) + real(j - 1) * column(by_moment, 1)
@@ -297,7 +301,7 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
         d = cell - vec3(real(x), real(y), real(z))
         wx, wy, wz, sx, sy, sz = weights(d[0]), weights(d[1]), weights(d[2]), slopes(d[0]), slopes(d[1]), slopes(d[2])
         first = wp.int64(b) * wp.int64(cotangent.shape[2]) + wp.int64(((x - 1) * ny + y - 1) * nz + z - 1)
-        m, volume = real(state[b, slot, wp.static(MASS), p]), real(state[b, slot, wp.static(VOLUME), p])
+        m, volume = number(state, b, slot, wp.static(MASS), p), number(state, b, slot, wp.static(VOLUME), p)
         v, slope = vector(state, b, slot, wp.static(V), p), affine(state, slot, numbers, b, p)
         rate, stress = tensor(state, b, slot, wp.static(C), p), tensor(state, b, slot, wp.static(STRESS), p)
         momentum = m * v - slope * d
@@ -320,14 +324,16 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
         of_d -= wp.transpose(slope) * of_momentum
         impulse, by_rate, by_stress = dt * kappa / dx, wp.ddot(of_slope, rate), wp.ddot(of_slope, stress)
         of_m += wp.dot(of_momentum, v) + dx * by_rate
-        of_sizes[b, 0, p] -= kappa / dx * volume * by_stress
-        of_sizes[b, 1, p] += m * by_rate + impulse / dx * volume * by_stress
+        add_entry(of_sizes, b, 0, p, -kappa / dx * volume * by_stress)
+        add_entry(of_sizes, b, 1, p, m * by_rate + impulse / dx * volume * by_stress)
         put_vector(of_state, b, 0, wp.static(CELLS), p, vector(of_state, b, 0, wp.static(CELLS), p) + of_d)
         put_vector(of_state, b, 0, wp.static(V), p, m * of_momentum)
         put_tensor(of_state, b, 0, wp.static(C), p, (dx * m) * of_slope)
         put_tensor(of_state, b, 0, wp.static(STRESS), p, (-impulse * volume) * of_slope)
-        of_state[b, 0, wp.static(MASS), p] += of_m
-        of_state[b, 0, wp.static(VOLUME), p] -= impulse * by_stress
+        of_m += number(of_state, b, 0, wp.static(MASS), p)
+        of_volume = number(of_state, b, 0, wp.static(VOLUME), p) - impulse * by_stress
+        put_number(of_state, b, 0, wp.static(MASS), p, of_m)
+        put_number(of_state, b, 0, wp.static(VOLUME), p, of_volume)
 
     # the frames, on the host
 
@@ -344,13 +350,7 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
                 device=places,
             )
 
-    def start(extrema, cleared, *others):
-        for array in (*cleared, *others):
-            if any(items > 1 and stride > _LARGEST for items, stride in zip(array.shape, array.strides)):
-                raise ValueError(
-                    f"an array {array.shape} of whole frames has more than 2 GiB from one simulation or state to the"
-                    " next: map simulations one by one (lax.map), or take SimConfig(whole_frames=False)"
-                )
+    def start(extrema, cleared):
         for array in cleared:
             array.zero_()
         wp.launch(begin, extrema.shape[0], [extrema], device=extrema.device)
@@ -360,7 +360,7 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
         walls_y: whole2, walls_z: whole2, contact: rows_array, grid: nodes_array, velocity: nodes_array,
         extrema: reals2, counts: whole3, sides: whole2,
     ):  # fmt: skip
-        start(extrema, (grid, counts, sides), state, contact)
+        start(extrema, (grid, counts, sides))
         slots = [(step, 0, 0, 0, 1) for step in range(counts.shape[1])]
         walls = (walls_x, walls_y, walls_z)
         forward(state, moduli, law, numbers, modes, walls, contact, grid, velocity, extrema, counts, sides, slots)
@@ -370,7 +370,7 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
         walls_y: whole2, walls_z: whole2, contact: rows_array, grid: nodes_array, velocity: nodes_array,
         extrema: reals2, counts: whole3, sides: whole2, kept: rows_array,
     ):  # fmt: skip
-        start(extrema, (grid, counts, sides), state, contact, kept)
+        start(extrema, (grid, counts, sides))
         walls, dims = (walls_x, walls_y, walls_z), (state.shape[0], ROWS, state.shape[3])
         for number, (low, high) in enumerate(blocks_of(counts.shape[1], kept.shape[1])):
             wp.launch(copy, dims, [state, 0, kept, number], device=state.device)
@@ -380,12 +380,11 @@ def frame_kernels(nodes: int, single: bool) -> FrameKernels:
     def adjoint(
         of_state: rows_array, kept: rows_array, moduli: reals3, law: whole2, numbers: reals2, modes: whole2,
         walls_x: whole2, walls_y: whole2, walls_z: whole2, contact: rows_array, of_moduli: reals3, of_sizes: reals3,
-        of_gravity: wp.array2d(dtype=vec4), of_contact: rows_array, of_friction: reals3, states: rows_array,
+        of_gravity: nodes_array, of_contact: rows_array, of_friction: reals3, states: rows_array,
         grids: nodes_array, velocity: nodes_array, cotangent: nodes_array, extrema: reals2, counts: whole3,
         sides: whole2,
     ):  # fmt: skip
-        cleared = of_moduli, of_sizes, of_gravity, of_contact, of_friction, counts, sides
-        start(extrema, cleared, states, kept, contact, grids)
+        start(extrema, (of_moduli, of_sizes, of_gravity, of_contact, of_friction, counts, sides))
         walls, device = (walls_x, walls_y, walls_z), states.device
         particles, all_nodes = (states.shape[0], states.shape[3]), (grids.shape[0], grids.shape[2])
         dims, blocks = (states.shape[0], ROWS, states.shape[3]), blocks_of(counts.shape[1], kept.shape[1])

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple, no_type_check
 
 import jax
 
-from pigjax.core.backend import import_warp
-from pigjax.mpm.warp_kernels import ADD, READ
+from pigjax.core.backend import import_warp, native
+from pigjax.mpm.warp_kernels import ADD, READ, WRITE
 
 CELLS, ROUNDED, V, C, F, STRESS, MASS, VOLUME, ROWS = 0, 3, 6, 9, 18, 27, 36, 37, 38  # rows of a particle's column
 DT, DX, GRAVITY, UNIT_MASS, LOW, HIGH, NUMBERS = 0, 1, 2, 5, 6, 9, 12  # places in the numbers that all share
@@ -34,12 +34,19 @@ class FrameTypes(NamedTuple):
     reals3: Any
     whole2: Any
     whole3: Any
+    # by flat indices of 64 bits: strides of Warp's arrays have 32, and a simulation or a slot may take more than 2 GiB
     add: Any  # (grid, flat index, value)
     read: Any  # (grid, flat index)
-    vector: Any  # three rows of a particle (rows, simulation, slot, first row, particle)
+    write: Any  # (grid, flat index, value)
+    number: Any  # a row of a particle (rows, simulation, slot, row, particle)
+    vector: Any  # three rows
     tensor: Any  # nine rows
+    put_number: Any  # (rows, simulation, slot, row, particle, value)
     put_vector: Any
     put_tensor: Any
+    entry: Any  # of numbers of particles or nodes (array, simulation, row, particle or node)
+    add_entry: Any  # (array, simulation, row, particle or node, value)
+    whole: Any  # number of a particle (array, simulation, particle)
     column: Any  # (tensor, number)
     four: Any  # (number, vector)
 
@@ -60,37 +67,81 @@ def frame_types(single: bool) -> FrameTypes:
     unrolled = {"max_unroll": 1 if jax.default_backend() == "cpu" else 16}
     kernel = functools.partial(wp.kernel, module="unique", enable_backward=False, module_options=unrolled)
 
-    def text(snippet):
-        return snippet.replace("SCALAR", "float" if single else "double").replace("FLOAT", str(int(single)))
-
-    @wp.func_native(text(ADD))
+    @wp.func_native(native(ADD, single))
     def add(grid: nodes_array, node: wp.int64, value: vec4): ...
 
-    @wp.func_native(text(READ))
+    @wp.func_native(native(READ, single))
     def read(grid: nodes_array, node: wp.int64) -> vec4: ...
+
+    @wp.func_native(native(WRITE, single))
+    def write(grid: nodes_array, node: wp.int64, value: vec4): ...
+
+    @wp.func_native("return s.data[at];")
+    def get(s: rows_array, at: wp.int64) -> real: ...
+
+    @wp.func_native("s.data[at] = value;")
+    def put(s: rows_array, at: wp.int64, value: real): ...
+
+    @wp.func_native("return numbers.data[at];")
+    def entry_at(numbers: reals3, at: wp.int64) -> real: ...
+
+    @wp.func_native("numbers.data[at] += value;")
+    def add_at(numbers: reals3, at: wp.int64, value: real): ...
+
+    @wp.func_native("return numbers.data[at];")
+    def whole_at(numbers: whole2, at: wp.int64) -> int: ...
+
+    @wp.func
+    def place(s: rows_array, b: int, slot: int, row: int, p: int):
+        slots = wp.int64(b) * wp.int64(s.shape[1]) + wp.int64(slot)
+        column = slots * (wp.int64(s.shape[2]) * wp.int64(s.shape[3])) + wp.int64(p)
+        return column + wp.int64(row) * wp.int64(s.shape[3])
+
+    @wp.func
+    def number(s: rows_array, b: int, slot: int, row: int, p: int):
+        return get(s, place(s, b, slot, row, p))
 
     @wp.func
     def vector(s: rows_array, b: int, slot: int, row: int, p: int):
-        return vec3(s[b, slot, row, p], s[b, slot, row + 1, p], s[b, slot, row + 2, p])
+        return vec3(number(s, b, slot, row, p), number(s, b, slot, row + 1, p), number(s, b, slot, row + 2, p))
 
     @wp.func
     def tensor(s: rows_array, b: int, slot: int, row: int, p: int):
-        return mat33(
-            s[b, slot, row, p], s[b, slot, row + 1, p], s[b, slot, row + 2, p],
-            s[b, slot, row + 3, p], s[b, slot, row + 4, p], s[b, slot, row + 5, p],
-            s[b, slot, row + 6, p], s[b, slot, row + 7, p], s[b, slot, row + 8, p],
-        )  # fmt: skip
+        x, y = vector(s, b, slot, row, p), vector(s, b, slot, row + 3, p)
+        z = vector(s, b, slot, row + 6, p)
+        return mat33(x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2])
+
+    @wp.func
+    def put_number(s: rows_array, b: int, slot: int, row: int, p: int, value: real):
+        put(s, place(s, b, slot, row, p), value)
 
     @wp.func
     def put_vector(s: rows_array, b: int, slot: int, row: int, p: int, value: vec3):
         for i in range(3):
-            s[b, slot, row + i, p] = value[i]
+            put(s, place(s, b, slot, row + i, p), value[i])
 
     @wp.func
     def put_tensor(s: rows_array, b: int, slot: int, row: int, p: int, value: mat33):
         for i in range(3):
             for j in range(3):
-                s[b, slot, row + 3 * i + j, p] = value[i, j]
+                put(s, place(s, b, slot, row + 3 * i + j, p), value[i, j])
+
+    @wp.func
+    def of_entry(numbers: reals3, b: int, row: int, p: int):
+        of_row = wp.int64(b) * wp.int64(numbers.shape[1]) + wp.int64(row)
+        return of_row * wp.int64(numbers.shape[2]) + wp.int64(p)
+
+    @wp.func
+    def entry(numbers: reals3, b: int, row: int, p: int):
+        return entry_at(numbers, of_entry(numbers, b, row, p))
+
+    @wp.func
+    def add_entry(numbers: reals3, b: int, row: int, p: int, value: real):
+        add_at(numbers, of_entry(numbers, b, row, p), value)
+
+    @wp.func
+    def whole(numbers: whole2, b: int, p: int):
+        return whole_at(numbers, wp.int64(b) * wp.int64(numbers.shape[1]) + wp.int64(p))
 
     @wp.func
     def column(m: mat33, j: int):
@@ -102,5 +153,5 @@ def frame_types(single: bool) -> FrameTypes:
 
     return FrameTypes(
         real, vec3, vec4, mat33, epsilon, tiny, kernel, nodes_array, rows_array, reals2, reals3, whole2, whole3, add,
-        read, vector, tensor, put_vector, put_tensor, column, four,
+        read, write, number, vector, tensor, put_number, put_vector, put_tensor, entry, add_entry, whole, column, four,
     )  # fmt: skip

@@ -112,7 +112,7 @@ def reorder(rows: Any, order: Int[Array, "p"], axis: int = 0) -> Any:
         own = [k for k, leaf in enumerate(leaves) if leaf.dtype == dtype]
         flat = [leaves[k].reshape(*leaves[k].shape[: axis + 1], -1) for k in own]
         packed = jnp.concatenate(flat, -1)
-        packed = jnp.take(packed, order, axis, mode="clip")
+        packed = jnp.take(packed, order, axis, mode="clip", unique_indices=True)  # its transpose needs no atomics
         ends = np.cumsum([part.shape[-1] for part in flat])[:-1]
         for k, part in zip(own, jnp.split(packed, ends, -1)):
             moved[k] = part.reshape(leaves[k].shape)

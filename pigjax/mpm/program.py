@@ -115,7 +115,7 @@ def run_frames(
         raise InputError("SimConfig.integrator = 'auto' is undecided: take what choose_integrator finds.")
     warp = takes_warp(config.backend, config.differentiation)
     if config.deterministic:
-        check_order(warp)
+        check_order(warp, config.integrator == "implicit")
     kernel, dtype = KERNELS[config.kernel], particles.x.dtype
     window, table, inputs = in_precision((window, table, inputs), dtype)
     grid, contact = window.grid, inputs.contact
@@ -130,6 +130,7 @@ def run_frames(
     still = grouping.still
     laws = tuple(group.law for group in grouping.groups)
     whole = _takes_whole_frames(config, inputs, laws, warp, devices)
+    specific_volume = partial(_specific_volume, particles, in_order=config.deterministic)
     context = StepContext(
         parameters=tuple(group.parameters for group in grouping.groups),
         grid=grid,
@@ -140,7 +141,7 @@ def run_frames(
         colliders=inputs.colliders,
         collider_contacts=tuple(None if c.moves else c.contact(points) for c in inputs.colliders),
         body_contact=contact,
-        specific_volume=None if contact is None else _specific_volume(particles, contact.bodies) / grid.dx**3,
+        specific_volume=None if contact is None else specific_volume(bodies) / grid.dx**3,
         frozen=_held_nodes(None if still is None else touched_nodes(grid, still.x, kernel), inputs.pins, points),
         unit_mass=lax.stop_gradient(jnp.where(jnp.isfinite(particles.mass), particles.mass, 0).max()),
         opaque_true=everywhere(~(particles.volume0[0] < -jnp.finfo(dtype).max)),  # true of NaN too
@@ -358,9 +359,13 @@ def _rigid_bodies(particles: Particles, table: MaterialTable, bodies: int) -> Bo
     return jax.ops.segment_max(own, particles.body if bodies > 1 else 0 * particles.body, bodies) > 0
 
 
-def _specific_volume(particles: Particles, bodies: int) -> Float[Array, "b"]:
-    """Of each body, on average [m³/kg]."""
-    volume, mass = (
-        jax.ops.segment_sum(values, particles.body, bodies) for values in (particles.volume0, particles.mass)
-    )
+def _specific_volume(particles: Particles, bodies: int, in_order: bool) -> Float[Array, "b"]:
+    """Of each body, on average [m³/kg]; `in_order` sums over all particles for each body, without a scatter."""
+
+    def total(values):
+        if not in_order:
+            return jax.ops.segment_sum(values, particles.body, bodies)
+        return jnp.where(particles.body == jnp.arange(bodies)[:, None], values, 0).sum(1)
+
+    volume, mass = total(particles.volume0), total(particles.mass)
     return volume / jnp.where(mass > 0, mass, 1.0)

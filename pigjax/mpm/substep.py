@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.mpm import WALL, Grid, State, StepHealth
 from pigjax.mpm.boundaries import Around, Bounds, hold, hold_at_edges, holder, places_of, smooth
-from pigjax.mpm.by_law import by_component, by_row
+from pigjax.mpm.by_law import by_component, by_row, parameters_of
 from pigjax.mpm.chunked import ChunkLoop, gather_chunks, scatter_chunks
 from pigjax.mpm.colliders import Collider, Contact, Press, Time
 from pigjax.mpm.contact import BodyContact, Faces, faces
@@ -442,12 +442,6 @@ def in_rows(state: State) -> State:
 def _reshaped(state: State, how: Callable[[Array], Array]) -> State:
     tensors = {"C": state.C, "F": state.F, "stress": state.stress, "visual": state.visual}
     return state._replace(**{name: how(tensor) for name, tensor in tensors.items() if tensor is not None})
-
-
-def parameters_of(parameters: Parameters, row: Float[Array, "c"]) -> Parameters:
-    """Parameters of each particle [c] from those of each material [m]; a sum whose transpose needs no scatter."""
-    count = len(jax.tree.leaves(parameters)[0])
-    return jax.tree.map(lambda p: sum(jnp.where(row == k, p[k], 0) for k in range(count)), parameters)
 
 
 def _only_finite(ok: Bool[Array, "c"], state: State, shape: tuple[int, int, int]) -> State:

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 from pigjax.core.errors import InputError
 from pigjax.mpm import WALL, State, StepHealth
 from pigjax.mpm.boundaries import places_of
+from pigjax.mpm.by_law import parameters_of
 from pigjax.mpm.colliders import Collider
 from pigjax.mpm.config import SimConfig
 from pigjax.mpm.frame_kernels import FrameKernels, frame_kernels
@@ -39,7 +40,7 @@ from pigjax.mpm.frame_types import (
     STICKY,
     V,
 )
-from pigjax.mpm.substep import StepContext, StepStatics, between_walls, parameters_of
+from pigjax.mpm.substep import StepContext, StepStatics, between_walls
 
 LAWS = {"fixed_corotated": FIXED_COROTATED, "neo_hookean": NEO_HOOKEAN}  # that the kernels know
 _MODES = {"separate": SEPARATE, "slip": SLIP, "sticky": STICKY}
@@ -125,13 +126,10 @@ def whole_frames(
     Raises:
         InputError: the grid has more nodes than 32 bits count.
     """
-    dtype = context.dt.dtype
     if math.prod(context.grid.shape) > np.iinfo(np.int32).max:
         raise InputError(
             f"a grid of {context.grid.shape} nodes is too large to be held at once: give SimConfig(box=...)."
         )
-    room = np.iinfo(np.int32).max // (ROWS * np.dtype(dtype).itemsize * sum(len(state.cells) for state in states))
-    block = min(block, max(1, room - 1))  # strides of Warp's arrays have 32 bits
     frame = _Frame(len(statics.kernel.offsets), context.grid.shape, steps, -(-steps // block))
     matter = _matter(statics, context, states)
     sizes = np.cumsum([len(state.cells) for state in states])[:-1].tolist()
@@ -218,7 +216,7 @@ def _backward(frame: _Frame, residuals: Any, cotangents: Any) -> tuple[Array, _M
     dims = _forward_dims(frame) | {
         "of_moduli": (1, 2, particles),
         "of_sizes": (1, 2, particles),
-        "of_gravity": (1, nodes),
+        "of_gravity": (1, 1, nodes),
         "of_contact": (1, *matter.contact.shape),
         "of_friction": (1, matter.contact.shape[0], matter.contact.shape[2]),
         "states": (1, block + 1, ROWS, particles),
@@ -229,7 +227,7 @@ def _backward(frame: _Frame, residuals: Any, cotangents: Any) -> tuple[Array, _M
     of_state, of_moduli, of_sizes, of_gravity, of_contact, of_friction, *_ = call(
         cotangents[0][None, None], kept, *_arrays(matter), output_dims=dims
     )
-    impulse = of_gravity[0, :, :3].sum(0)
+    impulse = of_gravity[0, 0, :, 1:].sum(0)
     of_dt, of_dx = of_sizes[0].sum(1)
     dt, gravity = matter.numbers[DT], matter.numbers[GRAVITY : GRAVITY + 3]
     of_numbers = jnp.zeros_like(matter.numbers)

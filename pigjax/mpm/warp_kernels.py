@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, no_type_check
 
 import jax
 
-from pigjax.core.backend import import_warp, launcher
+from pigjax.core.backend import import_warp, launcher, native
 
 
 class TransferKernels(NamedTuple):
@@ -49,14 +49,14 @@ READ = """
 #endif
 """
 
-_LOAD = READ.replace("grid.", "rows.").replace("node", "at")
-_STORE = """
+WRITE = """
 #if defined(__CUDA_ARCH__) && FLOAT
-    *(float4*)(&rows.data[at]) = make_float4(value[0], value[1], value[2], value[3]);
+    *(float4*)(&grid.data[node]) = make_float4(value[0], value[1], value[2], value[3]);
 #else
-    rows.data[at] = value;
+    grid.data[node] = value;
 #endif
 """
+_LOAD, _STORE = (snippet.replace("grid.", "rows.").replace("node", "at") for snippet in (READ, WRITE))
 
 
 @functools.cache
@@ -129,25 +129,35 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
     first_offset = -1
     real_name = "float" if single else "double"
 
-    def text(snippet):
-        return snippet.replace("SCALAR", real_name).replace("FLOAT", str(int(single)))
-
     # unrolled loops take seconds to compile; a CPU gains little from them
     unrolled = {"max_unroll": 1 if jax.default_backend() == "cpu" else 16}
     kernel = functools.partial(wp.kernel, module="unique", enable_backward=False, module_options=unrolled)
 
-    # indices of 64 bits: a batch of simulations may have more nodes and particles than 32 bits count
-    @wp.func_native(text(ADD))
+    # Indices of 64 bits: a batch may have more nodes and particles than 32 bits count. Strides of Warp's arrays have 32
+    # bits and wrap where a simulation takes more than 2 GiB.
+    @wp.func_native(native(ADD, single))
     def add(grid: wp.array4d(dtype=vec4), node: wp.int64, value: vec4): ...
 
-    @wp.func_native(text(READ))
+    @wp.func_native(native(READ, single))
     def read(grid: wp.array4d(dtype=vec4), node: wp.int64) -> vec4: ...
 
-    @wp.func_native(text(_LOAD))
+    @wp.func_native(native(WRITE, single))
+    def write(grid: wp.array4d(dtype=vec4), node: wp.int64, value: vec4): ...
+
+    @wp.func_native(native(_LOAD, single))
     def load(rows: wp.array2d(dtype=vec4), at: wp.int64) -> vec4: ...
 
-    @wp.func_native(text(_STORE))
+    @wp.func_native(native(_STORE, single))
     def store(rows: wp.array2d(dtype=vec4), at: wp.int64, value: vec4): ...
+
+    @wp.func_native("return cells.data[at];")
+    def cell_of(cells: wp.array2d(dtype=vec3), at: wp.int64) -> vec3: ...
+
+    @wp.func_native("cells.data[at] = value;")
+    def put_cell(cells: wp.array2d(dtype=vec3), at: wp.int64, value: vec3): ...
+
+    @wp.func_native("return numbers.data[at];")
+    def whole(numbers: wp.array2d(dtype=wp.int32), at: wp.int64) -> int: ...
 
     weights, slopes, anchor = spline_functions(nodes, nearest, single)
 
@@ -168,11 +178,11 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
         slope_z: wp.array2d(dtype=vec4), cells: wp.array2d(dtype=vec3), grid: wp.array4d(dtype=vec4),
     ):  # fmt: skip
         b, p = wp.tid()
-        cell = cells[b, p]
+        row_of = row_at(cells, b, p)
+        cell = cell_of(cells, row_of)
         x, y, z = anchor(cell[0], grid.shape[1]), anchor(cell[1], grid.shape[2]), anchor(cell[2], grid.shape[3])
         wx, wy, wz = weights(cell[0] - real(x)), weights(cell[1] - real(y)), weights(cell[2] - real(z))
         node, row, plane = first_node(grid, b, x, y, z), grid.shape[3], grid.shape[2] * grid.shape[3]
-        row_of = row_at(cells, b, p)
         p0, px, py, pz = load(constant, row_of), load(slope_x, row_of), load(slope_y, row_of), load(slope_z, row_of)
         for i in range(wp.static(nodes)):
             at_x = p0 + real(wp.static(first_offset) + i) * px
@@ -189,11 +199,11 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
         slope_z: wp.array2d(dtype=vec4),
     ):  # fmt: skip
         b, p = wp.tid()
-        cell = cells[b, p]
+        row_of = row_at(cells, b, p)
+        cell = cell_of(cells, row_of)
         x, y, z = anchor(cell[0], grid.shape[1]), anchor(cell[1], grid.shape[2]), anchor(cell[2], grid.shape[3])
         wx, wy, wz = weights(cell[0] - real(x)), weights(cell[1] - real(y)), weights(cell[2] - real(z))
         node, row, plane = first_node(grid, b, x, y, z), grid.shape[3], grid.shape[2] * grid.shape[3]
-        row_of = row_at(cells, b, p)
         m0, mx, my, mz = vec4(), vec4(), vec4(), vec4()
         for i in range(wp.static(nodes)):
             s0, sy, sz = vec4(), vec4(), vec4()  # of the plane
@@ -222,12 +232,12 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
         slope_z: wp.array2d(dtype=vec4), of_cells: wp.array2d(dtype=vec3),
     ):  # fmt: skip
         b, p = wp.tid()
-        cell = cells[b, p]
+        row_of = row_at(cells, b, p)
+        cell = cell_of(cells, row_of)
         x, y, z = anchor(cell[0], grid.shape[1]), anchor(cell[1], grid.shape[2]), anchor(cell[2], grid.shape[3])
         dx, dy, dz = cell[0] - real(x), cell[1] - real(y), cell[2] - real(z)
         wx, wy, wz, sx, sy, sz = weights(dx), weights(dy), weights(dz), slopes(dx), slopes(dy), slopes(dz)
         node, row, plane = first_node(grid, b, x, y, z), grid.shape[3], grid.shape[2] * grid.shape[3]
-        row_of = row_at(cells, b, p)
         q0, qx, qy, qz = load(p0, row_of), load(px, row_of), load(py, row_of), load(pz, row_of)
         m0, mx, my, mz, slope = vec4(), vec4(), vec4(), vec4(), vec3()
         for i in range(wp.static(nodes)):
@@ -252,7 +262,7 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
         store(slope_x, row_of, mx)
         store(slope_y, row_of, my)
         store(slope_z, row_of, mz)
-        of_cells[b, p] = slope
+        put_cell(of_cells, row_of, slope)
 
     @kernel
     def gather_adjoint(
@@ -261,12 +271,13 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
         of_cells: wp.array2d(dtype=vec3),
     ):  # fmt: skip
         b, p = wp.tid()
-        cell = cells[b, p]
+        row_of = row_at(cells, b, p)
+        cell = cell_of(cells, row_of)
         x, y, z = anchor(cell[0], grid.shape[1]), anchor(cell[1], grid.shape[2]), anchor(cell[2], grid.shape[3])
         dx, dy, dz = cell[0] - real(x), cell[1] - real(y), cell[2] - real(z)
         wx, wy, wz, sx, sy, sz = weights(dx), weights(dy), weights(dz), slopes(dx), slopes(dy), slopes(dz)
         node, row, plane = first_node(grid, b, x, y, z), grid.shape[3], grid.shape[2] * grid.shape[3]
-        row_of, slope = row_at(cells, b, p), vec3()
+        slope = vec3()
         q0, qx, qy, qz = load(p0, row_of), load(px, row_of), load(py, row_of), load(pz, row_of)
         for i in range(wp.static(nodes)):
             at_x = q0 + real(wp.static(first_offset) + i) * qx
@@ -281,7 +292,7 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
                     along += sz[k] * product
                     add(of_grid, at, (w * wz[k]) * cotangent)
                 slope += vec3(sx[i] * wy[j] * even, wx[i] * sy[j] * even, w * along)
-        of_cells[b, p] = slope
+        put_cell(of_cells, row_of, slope)
 
     @kernel
     def scatter_in_order(
@@ -292,21 +303,24 @@ def transfer_kernels(nodes: int, nearest: bool, single: bool) -> TransferKernels
     ):  # fmt: skip
         b, x, y, z = wp.tid()
         ny, nz, side = grid.shape[2], grid.shape[3], int(wp.static(nodes))  # a variable: its loops are not unrolled
-        value = grid[b, x, y, z]
+        node = ((wp.int64(b) * wp.int64(grid.shape[1]) + wp.int64(x)) * wp.int64(ny) + wp.int64(y)) * wp.int64(nz)
+        node += wp.int64(z)
+        value, first = read(grid, node), wp.int64(b) * wp.int64(start.shape[1])
         for i in range(side):
             for j in range(side):
                 for k in range(side):
                     oi, oj, ok = i + wp.static(first_offset), j + wp.static(first_offset), k + wp.static(first_offset)
                     ax, ay, az = x - oi, y - oj, z - ok
                     if ax >= 0 and ay >= 0 and az >= 0 and ax < grid.shape[1] and ay < ny and az < nz:
-                        cell = (ax * ny + ay) * nz + az
-                        for s in range(start[b, cell], start[b, cell + 1]):
-                            p = order[b, s]
-                            d = cells[b, p] - vec3(real(ax), real(ay), real(az))
+                        own = first + wp.int64((ax * ny + ay) * nz + az)
+                        for s in range(whole(start, own), whole(start, own + wp.int64(1))):
+                            row_of = row_at(cells, b, whole(order, row_at(cells, b, s)))
+                            d = cell_of(cells, row_of) - vec3(real(ax), real(ay), real(az))
                             wx, wy, wz = weights(d[0]), weights(d[1]), weights(d[2])
-                            at_x = p0[b, p] + real(oi) * px[b, p]
-                            value += (wx[i] * wy[j] * wz[k]) * (at_x + real(oj) * py[b, p] + real(ok) * pz[b, p])
-        total[b, x, y, z] = value
+                            at_x = load(p0, row_of) + real(oi) * load(px, row_of)
+                            at_xyz = at_x + real(oj) * load(py, row_of) + real(ok) * load(pz, row_of)
+                            value += (wx[i] * wy[j] * wz[k]) * at_xyz
+        write(total, node, value)
 
     def function(kernel, outputs, in_out=()):
         return launcher(kernel, f"{kernel.func.__name__}_{nodes}_{real_name}", outputs, in_out)

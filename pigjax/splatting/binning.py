@@ -101,13 +101,18 @@ def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: b
     tiles = -(-camera.width // config.tile_size) * -(-camera.height // config.tile_size)
     chunk = 64 if 6 * count > 32 * tiles else 16
     warp = takes_warp(config.backend, config.differentiation)
-    limit = config.slots or 2 ** (17 if on_cpu else 23 if warp else 21) // config.bands
+    # Estimates for a CUDA device: a pass costs tens of launches and a wait of the host, 0.1 ms; an empty slot is only
+    # sorted, by 50 bytes of traffic, so that 2²⁴ of them cost 0.2 ms, and 24 bytes of memory. Of a million splats at
+    # 1080p each may touch 29 tiles: 16 slots a splat hold them in two passes instead of five. The second pass leaves
+    # out what is behind tiles that the first one closed, which a single pass would list.
+    cuda = warp and not on_cpu
+    limit = config.slots or 2 ** (17 if on_cpu else 24 if warp else 21) // config.bands
     return BlendConfig(
         width=camera.width,
         height=camera.height,
         tile=config.tile_size,
         chunk=config.chunk or chunk,
-        slots=slots_of(count, tiles, config.capacity, limit, one_key=not warp),
+        slots=slots_of(count, tiles, config.capacity, limit, each=16 if cuda else 6, one_key=not warp),
         capacity=config.capacity,
         tiles_at_once=config.tiles_at_once or (1 if on_cpu else 2048),
         by_products=not on_cpu,
@@ -121,13 +126,13 @@ def blend_config(camera: Camera, config: RenderConfig, count: int, *, surface: b
     )
 
 
-def slots_of(count: int, tiles: int, capacity: int | None, limit: int, *, one_key: bool = True) -> int:
-    """Static size of a pass: 6 pairs per splat, at most `limit` and the capacity, and at least the number of tiles.
+def slots_of(count: int, tiles: int, capacity: int | None, limit: int, *, each: int = 6, one_key: bool = True) -> int:
+    """Static size of a pass: `each` pairs per splat, at most `limit` and the capacity, at least the number of tiles.
 
     A splat that covers every tile has to fit into one pass. With `one_key`, (tile, slot) stay within one sort key.
     """
     most = (_KEY_LIMIT - 1) // (tiles + 1) if one_key else limit
-    return max(tiles, min(6 * count, limit, capacity or limit, most))
+    return max(tiles, min(each * count, limit, capacity or limit, most))
 
 
 def bin_splats(projected: Projected, config: BlendConfig) -> Boxes:

@@ -76,7 +76,7 @@ class RenderConfig(eqx.Module):
     tile_size: int = static_field(default=16, limits=Limits(1, 1024, unit="px"))
     # splat/tile pairs per image, far splats dropped first; None: unlimited ("forward": 16 per splat)
     capacity: int | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
-    # splat/tile pairs binned in one pass; None: 2¹⁷ on a CPU, 2²¹ elsewhere, 2²³ by Warp, divided by `bands`
+    # splat/tile pairs binned in one pass; None: 2¹⁷ on a CPU, 2²¹ elsewhere, 2²⁴ by Warp, divided by `bands`
     slots: int | None = static_field(default=None, limits=Limits(1, LARGEST_WHOLE))
     sh_degree: int | None = static_field(default=None, limits=Limits(0, 3))  # None: the degree that the splats have
     # fainter contributions are skipped

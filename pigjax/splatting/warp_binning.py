@@ -35,7 +35,7 @@ def slots_by_tile(
         open_tiles: tiles that take splats.
         grid: tiles per image row, and the edge of a tile [px].
         least_exponent: log of the least alpha on a tile for which a splat is listed.
-        slots: static size of the pass.
+        slots: static size of the pass; it may be below the number of tiles.
 
     Returns:
         Rank and tile, and the first slot of each tile and of what no tile owns; the tile equals the number of tiles in
@@ -44,13 +44,15 @@ def slots_by_tile(
     shapes = lax.stop_gradient(shapes)
     tiles, dtype = len(open_tiles), shapes.dtype
     limits = jnp.full((1, 4), least_exponent, dtype)
-    empty, is_open = jnp.zeros((1, 2 * slots), jnp.int32), open_tiles.astype(jnp.int32)[None]
+    # a thread of `lists` for each number of the buffers writes the first slot of a tile, or the end of the last
+    room = max(slots, tiles)
+    empty, is_open = jnp.zeros((1, 2 * room), jnp.int32), open_tiles.astype(jnp.int32)[None]
     arrays = (shapes, low, size, end, before)
     kernels = list_kernels(dtype == jnp.float32)
     # a batch gives all of these arrays its axis, which a launch reads from the first
     sizes = jnp.asarray([grid], jnp.int32)
     buffers = kernels.slots(empty, empty, *(a[None] for a in arrays), is_open, limits, sizes)
     buffers = radix_sort()(*buffers, is_open)
-    dims = {"tile": (1, slots), "rank": (1, slots), "start": (1, tiles + 1)}
+    dims = {"tile": (1, room), "rank": (1, room), "start": (1, tiles + 1)}
     tile, rank, start = kernels.lists(*buffers, is_open, output_dims=dims)
-    return rank[0], tile[0], start[0]
+    return rank[0, :slots], tile[0, :slots], start[0]

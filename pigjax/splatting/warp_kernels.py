@@ -2,9 +2,9 @@
 # ruff: noqa: RUF046, UP018
 """Warp kernels of the rasterizer: slots of the lists of tiles, their sort, blending, its adjoint, and credits.
 
-One thread a pixel and one block of 256 a tile of 16 x 16; every thread of a tile walks the list of its tile. The
-gradient of a splat is summed over a warp by shuffles before the atomics. Every array has a leading axis of images, so
-that many cameras are one launch. As in `mpm.warp_kernels`, a launch takes its sizes from the shapes of its arrays.
+One thread a pixel and one block of 256 a tile of 16 x 16; every thread of a tile walks the list of its tile. Gradients
+and credits of a splat are summed over a warp by shuffles before the atomics. Every array has a leading axis of images,
+so that many cameras are one launch. As in `mpm.warp_kernels`, a launch takes its sizes from the shapes of its arrays.
 
 Kernels are in Warp's language: annotations are calls, and int(0) declares a variable where 0 is a constant.
 """
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, no_type_check
 
 import jax
 
-from pigjax.core.backend import caller, import_warp, launcher
+from pigjax.core.backend import caller, import_warp, launcher, native
 
 QUADS = 2  # of a splat's row before its channels: x, y, conic xx, xy; conic yy, log opacity, depth, 0
 
@@ -61,6 +61,19 @@ _ANY = """
     return flag;
 #endif
 """
+# Of one number; what no thread of a warp has is not added.
+_ADD_ONE = """
+#if defined(__CUDA_ARCH__)
+    SCALAR one = value;
+    if (whole) {
+        for (int o = 16; o > 0; o /= 2) one += __shfl_xor_sync(0xffffffffu, one, o);
+        if ((threadIdx.x & 31) != 0) return;
+    }
+    if (one != 0) atomicAdd((SCALAR*)(&sums.data[at]), one);
+#else
+    sums.data[at] = sums.data[at] + value;
+#endif
+"""
 # A value's numbers beyond those that are filled are 0 in every thread.
 _ADD = """
 #if defined(__CUDA_ARCH__)
@@ -88,6 +101,13 @@ _READ = """
     return rows.data[at];
 #endif
 """
+_WRITE = """
+#if defined(__CUDA_ARCH__) && FLOAT
+    *(float4*)(&rows.data[at]) = make_float4(value[0], value[1], value[2], value[3]);
+#else
+    rows.data[at] = value;
+#endif
+"""
 
 
 @no_type_check
@@ -96,17 +116,15 @@ def _tools(wp: Any, single: bool) -> Any:
     real = wp.float32 if single else wp.float64
     vec2, vec4 = (wp.types.vector(length=k, dtype=real) for k in (2, 4))
 
-    def text(snippet):
-        return snippet.replace("SCALAR", "float" if single else "double").replace("FLOAT", str(int(single)))
-
     @wp.func_native(_ANY)
     def any_of_warp(flag: int, whole: int) -> int: ...
 
-    # indices of 64 bits: the images of a batch may have more rows than 32 bits count
-    @wp.func_native(text(_ADD))
+    # Indices of 64 bits: the images of a batch may have more rows than 32 bits count. Strides of Warp's arrays have 32
+    # bits and wrap where an image takes more than 2 GiB, as those of wide channels and of shapes may.
+    @wp.func_native(native(_ADD, single))
     def add(sums: wp.array3d(dtype=vec4), at: wp.int64, value: vec4, filled: int, whole: int): ...
 
-    @wp.func_native(text(_READ))
+    @wp.func_native(native(_READ, single))
     def read(rows: wp.array3d(dtype=vec4), at: wp.int64) -> vec4: ...
 
     @wp.func
@@ -158,6 +176,18 @@ def blend_kernels(channels: int, single: bool) -> BlendKernels:
     kernel, real, vec4, any_of_warp, add, add_shape, read, row_of, pixel_centre, opacity = _tools(wp, single)
     sums_of = wp.types.matrix(shape=(channels, 4), dtype=real)
 
+    @wp.func_native(native(_READ, single))
+    def plane(rows: wp.array4d(dtype=vec4), at: wp.int64) -> vec4: ...
+
+    @wp.func_native(native(_WRITE, single))
+    def put_plane(rows: wp.array4d(dtype=vec4), at: wp.int64, value: vec4): ...
+
+    @wp.func
+    def plane_at(planes: wp.array4d(dtype=vec4), b: int, tile: int, q: int, pixel: int):
+        """Flat index: the planes of an image may take more than 2 GiB."""
+        of_tile = wp.int64(b) * wp.int64(planes.shape[1]) + wp.int64(tile)
+        return (of_tile * wp.int64(planes.shape[2]) + wp.int64(q)) * wp.int64(planes.shape[3]) + wp.int64(pixel)
+
     @kernel
     def blend(
         transmittance: wp.array3d(dtype=real), planes: wp.array4d(dtype=vec4), surface: wp.array3d(dtype=real),
@@ -170,7 +200,7 @@ def blend_kernels(channels: int, single: bool) -> BlendKernels:
         through, picked = real(transmittance[b, tile, pixel]), real(surface[b, tile, pixel])
         total = sums_of()
         for q in range(wp.static(channels)):
-            total[q] = planes[b, tile, q, pixel]
+            total[q] = plane(planes, plane_at(planes, b, tile, q, pixel))
         for s in range(start[b, tile], start[b, tile + 1]):
             if through <= least:
                 break
@@ -189,7 +219,7 @@ def blend_kernels(channels: int, single: bool) -> BlendKernels:
         transmittance[b, tile, pixel] = through
         surface[b, tile, pixel] = picked
         for q in range(wp.static(channels)):
-            planes[b, tile, q, pixel] = total[q]
+            put_plane(planes, plane_at(planes, b, tile, q, pixel), total[q])
 
     @kernel
     def blend_adjoint(
@@ -207,7 +237,7 @@ def blend_kernels(channels: int, single: bool) -> BlendKernels:
         sum_ = total[b, tile, pixel]
         cotangent = sums_of()
         for q in range(wp.static(channels)):
-            cotangent[q] = of_planes[b, tile, q, pixel]
+            cotangent[q] = plane(of_planes, plane_at(of_planes, b, tile, q, pixel))
         for s in range(start[b, tile], start[b, tile + 1]):
             is_open = int(0)
             if through > least:
@@ -357,8 +387,17 @@ def surface_kernels(single: bool) -> SurfaceKernels:
 def list_kernels(single: bool) -> ListKernels:
     """Kernels that write the slots of lists and sum credits, in single or double precision."""
     wp = import_warp()
-    kernel, real, vec4, _, _, _, read, row_of, pixel_centre, opacity = _tools(wp, single)
+    kernel, real, vec4, any_of_warp, _, _, read, row_of, pixel_centre, opacity = _tools(wp, single)
     pair, most = wp.vec2i, _SORTED_AT_ONCE
+
+    @wp.func_native(native(_ADD_ONE, single))
+    def add_one(sums: wp.array3d(dtype=real), at: wp.int64, value: real, whole: int): ...
+
+    @wp.func_native("return numbers.data[at];")
+    def entry(numbers: wp.array3d(dtype=real), at: wp.int64) -> real: ...
+
+    @wp.func_native("return ids.data[at];")
+    def id_at(ids: wp.array3d(dtype=wp.int32), at: wp.int64) -> int: ...
 
     @wp.func
     def place(images: int, b: int, slots: int, values: int):
@@ -396,9 +435,12 @@ def list_kernels(single: bool) -> ListKernels:
             column = low[b, owner][0] + within % across
             row = low[b, owner][1] + within // across
             here = wp.clamp(row * columns + column, 0, open_.shape[1] - 1)
-            a, c_xy, c = shapes[b, owner, 2], shapes[b, owner, 3], shapes[b, owner, 4]
-            x0 = real(column * edge) + real(0.5) - shapes[b, owner, 0]
-            y0 = real(row * edge) + real(0.5) - shapes[b, owner, 1]
+            at = (wp.int64(b) * wp.int64(count) + wp.int64(owner)) * wp.int64(shapes.shape[2])
+            x, y = entry(shapes, at), entry(shapes, at + wp.int64(1))
+            a, c_xy = entry(shapes, at + wp.int64(2)), entry(shapes, at + wp.int64(3))
+            c, peak = entry(shapes, at + wp.int64(4)), entry(shapes, at + wp.int64(5))
+            x0 = real(column * edge) + real(0.5) - x
+            y0 = real(row * edge) + real(0.5) - y
             x1, y1 = x0 + real(edge - 1), y0 + real(edge - 1)
             lowest = real(0.0)
             if x0 > real(0.0) or x1 < real(0.0) or y0 > real(0.0) or y1 < real(0.0):
@@ -412,7 +454,7 @@ def list_kernels(single: bool) -> ListKernels:
                         fall(a, c_xy, c, wp.clamp(-c_xy * y1 / a, x0, x1), y1),
                     ),
                 )
-            if open_[b, here] != 0 and shapes[b, owner, 5] - lowest >= limits[b][0]:
+            if open_[b, here] != 0 and peak - lowest >= limits[b][0]:
                 found = here
         line, first, low_key = place(keys.shape[0], b, slots, open_.shape[1] + 1)
         keys[line, first + slot] = low_key + found
@@ -447,22 +489,33 @@ def list_kernels(single: bool) -> ListKernels:
         transmittance: wp.array3d(dtype=real),
     ):  # fmt: skip
         b, tile, pixel = wp.tid()
-        at = pixel_centre(tile, pixel, sizes[b, 0], sizes[b, 1])
-        through, own = real(1.0), ids[b, tile, pixel]
+        at, whole = pixel_centre(tile, pixel, sizes[b, 0], sizes[b, 1]), int(0)
+        if ids.shape[2] % 32 == 0:
+            whole = 1
+        through, own, asked = real(1.0), ids[b, tile, pixel], candidates.shape[2]
         for s in range(start[b, tile], start[b, tile + 1]):
-            if through <= limits[b][2]:
+            is_open = int(0)
+            if through > limits[b][2]:
+                is_open = 1
+            if any_of_warp(is_open, whole) == 0:
                 break
             splat = rank[b, s]
             row = row_of(rows, b, splat)
             first, second = read(rows, row), read(rows, row + wp.int64(1))
             alpha = wp.min(opacity(first, second, at[0] - first[0], at[1] - first[1]), limits[b][1])
-            if alpha >= limits[b][0]:
-                weight = alpha * through
-                if through - weight > limits[b][2] and own >= 0:
-                    for j in range(candidates.shape[2]):
-                        if candidates[b, splat, j] == own:
-                            wp.atomic_add(credits_, b, splat, j, weight)
+            weight, seen = real(0.0), int(0)
+            if is_open == 1 and alpha >= limits[b][0]:
+                if through - alpha * through > limits[b][2] and own >= 0:
+                    weight = alpha * through
+                    seen = 1
                 through = through * (real(1.0) - alpha)
+            if any_of_warp(seen, whole) == 1:
+                of_splat = (wp.int64(b) * wp.int64(candidates.shape[1]) + wp.int64(splat)) * wp.int64(asked)
+                for j in range(asked):
+                    share = real(0.0)
+                    if id_at(candidates, of_splat + wp.int64(j)) == own:
+                        share = weight
+                    add_one(credits_, of_splat + wp.int64(j), share, whole)
         transmittance[b, tile, pixel] = through
 
     name = "float" if single else "double"

@@ -1,5 +1,7 @@
 """Bodies that sleep: what is simulated without them is what is simulated with them, and they wake before contact."""
 
+import importlib.util
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -34,10 +36,11 @@ def cubes(corners, velocities):
     return make_particles(jnp.asarray(x), volume=(DX / 2) ** 3, table=TABLE, velocity=jnp.asarray(velocity), body=body)
 
 
-def simulate(particles, *, frames, sleep=None, gravity=NO_GRAVITY, frame_dt=0.02, colliders=(), substeps=16):
+def simulate(particles, *, frames, sleep=None, gravity=NO_GRAVITY, frame_dt=0.02, colliders=(), substeps=16, **config):
+    settings = SimConfig(substeps=substeps, devices=1, **config)
     return rollout(
-        particles, vast_grid(DX), TABLE, SimConfig(substeps=substeps, devices=1), frames=frames, frame_dt=frame_dt,
-        gravity=gravity, colliders=colliders, sleep=sleep,
+        particles, vast_grid(DX), TABLE, settings, frames=frames, frame_dt=frame_dt, gravity=gravity,
+        colliders=colliders, sleep=sleep,
     )  # fmt: skip
 
 
@@ -72,6 +75,27 @@ def test_a_block_hit_by_another_moves_as_if_it_had_never_slept(x64, simulated):
     assert float(jnp.abs(plain_path.x[woken - 1, :128] - row.x[:128]).max()) < 1e-12  # nothing had touched it
     assert float(jnp.abs(end.x[:64] - row.x[:64]).max()) > 0.2 * DX  # the push went through to the second one
     assert float(health.max_courant) == pytest.approx(float(plain_health.max_courant))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="needs warp-lang")
+@pytest.mark.parametrize("whole", [True, False], ids=["whole frames", "transfers"])
+def test_bodies_sleep_and_wake_on_warp_as_under_xla(x64, simulated, whole):
+    """Two move and rest, and one of them is hit: the same bodies are left out of the same frames."""
+    row = cubes([(0, 0, 0), (2, 0, 0), (10, 0.3, 0.2)], [(0, 0, 0), (0, 0, 0), (-2.0, 0, 0)])
+    found, counts = [], []
+    for config in ({"backend": "warp", "whole_frames": whole}, {"backend": "xla"}):
+        end, path, _ = simulate(row, frames=14, sleep=Sleep(frames=2), **config)
+        found.append((end.x, end.v, end.F, end.C, path.x))
+        counts.append(simulated[:])
+        simulated.clear()
+    assert counts[0] == counts[1]
+    assert counts[0][2] == 64
+    assert counts[0][-1] == 192
+    for own, other in zip(*found):
+        np.testing.assert_allclose(
+            own, other, rtol=0, atol=1e-10 * float(jnp.abs(other).max())
+        )  # rounding of 224 steps
 
 
 def test_what_gets_farther_than_its_speed_told_wakes_others_in_the_same_frame(x64, simulated):

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from pigjax.mpm.by_law import by_component
+from pigjax.mpm.by_law import by_component, parameters_of
 from pigjax.mpm.layout import State
 from pigjax.mpm.materials import Parameters, law_of, respond
 from pigjax.mpm.materials.tensors import cofactors, determinant, identity, product
-from pigjax.mpm.substep import StepContext, StepStatics, parameters_of
+from pigjax.mpm.substep import StepContext, StepStatics
 from pigjax.mpm.transfers import (
     CHANNELS,
     Kernel,
