@@ -16,7 +16,9 @@ _UP = "Direction that points up: x, y, z, -x, -y, -z, or 'X Y Z'; from cameras o
 
 @app.command()
 def new(
-    source: Annotated[Path, typer.Argument(help="Trained .ply, .splat, .spz; posed photos, or the folder of all.")],
+    source: Annotated[
+        Path, typer.Argument(help="Trained .ply, .splat, .spz, .sog, .glb, USD; posed photos; or the folder.")
+    ],
     out: Annotated[
         Path | None,
         typer.Option(

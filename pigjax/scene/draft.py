@@ -118,7 +118,7 @@ def draft_scene(
         parts = _masked_parts(gaussians, here, views, names)
     else:
         ground = ground_height(np.asarray(here.means, np.float64)[extent.core], _Z)
-        parts, labels = _connected_parts(here, extent.core, ground)
+        parts, labels = _connected_parts(here, extent.core, ground, has_views=views is not None)
         remarks.append(
             "no masks: objects are the connected parts above the ground; for other ones give"
             " objects.<name>.within = { lower = [x, y, z], upper = [x, y, z] }, or masks of posed photos."
@@ -264,9 +264,12 @@ def _masked_parts(gaussians: Gaussians, here: Gaussians, views: io.Views, names:
 
 
 def _connected_parts(
-    gaussians: Gaussians, core: Bool[np.ndarray, "n"], ground: float | None
+    gaussians: Gaussians, core: Bool[np.ndarray, "n"], ground: float | None, *, has_views: bool
 ) -> tuple[list[Part], Labels | None]:
-    """Parts above the ground, the largest first, and the labels that say so; a single one without a ground has none."""
+    """Parts above the ground, the largest first, and the labels that say so.
+
+    A single one without a ground needs none, unless there are photos, of which a scene without labels wants masks.
+    """
     means = np.asarray(gaussians.means, np.float64)
     heights = np.where(core, means[:, 2], -np.inf)
     free = core.copy()
@@ -287,7 +290,7 @@ def _connected_parts(
         object_id[:] = 1
     count = min(len(kept), _MOST_PARTS)
     parts = [_part(f"part_{k}", k, (object_id == k) & core, means) for k in range(1, count + 1)]
-    if ground is None and count == 1:
+    if ground is None and count == 1 and not has_views:
         return parts, None
     votes = np.zeros((len(means), count + 1), np.int32)
     votes[np.arange(len(means)), object_id] = 1

@@ -5,6 +5,7 @@ import warnings
 from pathlib import Path
 
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import pytest
 from PIL import Image
@@ -12,8 +13,12 @@ from typer.testing import CliRunner
 
 from pigjax import io
 from pigjax.cli import app
+from pigjax.cli.drafting import write_draft
+from pigjax.cli.segmenting import describe_file
+from pigjax.cli.viewer.opened import open_path
 from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io.finding import find_parts
+from pigjax.io.formats import SPLAT_SUFFIXES
 from pigjax.scene import load_scene, run_scene
 from pigjax.scene.draft import (
     Part,
@@ -134,6 +139,37 @@ def test_a_single_thing_is_one_object(tmp_path):
     assert (list(scene.objects), scene.input.labels, scene.world.up) == (["part_1"], None, "y")
     assert scene.world.origin[1] == pytest.approx(-0.3, abs=0.02)
     assert scene.planes["ground"].point[2] == 0
+
+
+def test_one_thing_with_photos_and_no_masks_is_a_scene_that_runs(tmp_path):
+    """Its file has labels, since a scene with photos and without labels wants masks."""
+    for name in ("transforms.json", "images"):
+        (tmp_path / name).symlink_to(TABLETOP / name)
+    io.save_ply(tmp_path / "ball.ply", splats(sphere(np.array([0, 0, 0.4]), 0.1, 600, np.random.default_rng(2))))
+    draft = write_draft(find_parts(tmp_path), tmp_path / "scene", up="z", ask=None)
+    assert draft.labels is not None
+    scene = load_scene(tmp_path / "scene" / "scene.toml")
+    assert (scene.input.labels, scene.objects["part_1"].id) == ("labels.npz", 1)
+    inputs = read_inputs(msgspec.structs.replace(scene, input=msgspec.structs.replace(scene.input, max_size=16)))
+    assert inputs.views.masks is None
+    assert (np.asarray(segment(scene, inputs).object_id) == 1).all()
+
+
+@pytest.mark.parametrize("suffix", SPLAT_SUFFIXES)
+def test_every_file_of_splats_is_described_viewed_found_and_drafted(suffix, tmp_path, monkeypatch):
+    """The commands take the suffixes of `load_gaussians`, whose readers have tests of their own."""
+    cloud = splats(sphere(np.zeros(3), 0.3, 60, np.random.default_rng(2)))
+    path = tmp_path / f"thing{suffix}"
+    path.write_bytes(b"")
+    for name in ("io.finding.load_gaussians", "io.load_gaussians"):
+        monkeypatch.setattr(f"pigjax.{name}", lambda *_, **__: cloud)
+    monkeypatch.setattr("pigjax.io.read_gaussians", lambda *_, **__: (cloud, 0))
+    monkeypatch.setattr("pigjax.io.origin_of", lambda _: (0.0, 0.0, 0.0))
+    assert describe_file(path)["Gaussians"] == "60"
+    assert len(open_path(path).gaussians) == 60
+    assert find_parts(path).gaussians == path
+    assert find_parts(tmp_path).gaussians == path
+    assert draft_scene(path, tmp_path, up="z").parts[0].name == "part_1"
 
 
 def test_a_plant_is_held_at_its_soil(tmp_path):

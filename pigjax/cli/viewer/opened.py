@@ -15,6 +15,7 @@ from jaxtyping import Int
 from pigjax import io
 from pigjax.core.errors import InputError
 from pigjax.core.upright import find_up
+from pigjax.io.formats import SPLAT_SUFFIXES
 from pigjax.scene import Scene, scene_from
 from pigjax.scene.arrangement import arrange
 from pigjax.scene.plan import Inputs, read_inputs, segment
@@ -25,7 +26,6 @@ from pigjax.splat import Gaussians
 from pigjax.splatting.types import extent_of
 
 Up = str | tuple[float, float, float]
-SPLATS = (".ply", ".splat", ".spz")
 _CELLS = 24  # of the scene's radius, where nothing says how fine its simulation is to be
 _FRAMES = 96
 
@@ -74,7 +74,7 @@ def open_path(
     """Read what is to be shown. Host.
 
     Args:
-        path: a `.ply`, `.splat` or `.spz`, a scene file, or the folder of a run, of `pigjax segment` or of a scene.
+        path: a file of splats, a scene file, or the folder of a run, of `pigjax segment` or of a scene.
         accuracy: level of the scene instead of its file's.
         drop_invalid: leave out Gaussians with NaN or infinity.
         origin: subtracted from the positions of a file of splats [m]; None: as the file says.
@@ -85,7 +85,7 @@ def open_path(
         MissingFileError: there is nothing at `path`.
         InputError: nothing there can be shown, or a file is damaged.
     """
-    if path.suffix.lower() in SPLATS:
+    if path.suffix.lower() in SPLAT_SUFFIXES:
         return _open_splats(path, drop_invalid, origin, up or "z")
     if path.suffix == ".toml":
         return _open_scene(read_file(path, "scene file"), path.parent, path.name, accuracy, tell)
@@ -95,7 +95,7 @@ def open_path(
         return _open_segments(path, drop_invalid, up or "z")
     if (path / "scene.toml").is_file():
         return _open_scene(read_file(path / "scene.toml", "scene file"), path, "scene.toml", accuracy, tell)
-    known = f"a {', '.join(SPLATS)}, a scene file (.toml), or the folder of a run, of 'pigjax segment' or of a scene"
+    known = f"a {', '.join(SPLAT_SUFFIXES)}, a scene file (.toml), or the folder of a run, of 'segment' or of a scene"
     io.output_folder(path) if path.is_dir() else io.read_gaussians(path)  # says what is wrong with the path itself
     raise InputError(f"{path}: nothing to show in it; give {known}.")
 
