@@ -141,18 +141,49 @@ def test_a_single_thing_is_one_object(tmp_path):
     assert scene.planes["ground"].point[2] == 0
 
 
-def test_one_thing_with_photos_and_no_masks_is_a_scene_that_runs(tmp_path):
+def test_one_thing_with_photos_and_no_masks_is_a_scene_that_runs(tmp_path, monkeypatch):
     """Its file has labels, since a scene with photos and without labels wants masks."""
+    monkeypatch.setattr("pigjax.cli.drafting.thumbnails", lambda _: {})
     for name in ("transforms.json", "images"):
         (tmp_path / name).symlink_to(TABLETOP / name)
     io.save_ply(tmp_path / "ball.ply", splats(sphere(np.array([0, 0, 0.4]), 0.1, 600, np.random.default_rng(2))))
-    draft = write_draft(find_parts(tmp_path), tmp_path / "scene", up="z", ask=None)
+    draft = write_draft(find_parts(tmp_path), tmp_path / "scene", up="z")
     assert draft.labels is not None
     scene = load_scene(tmp_path / "scene" / "scene.toml")
     assert (scene.input.labels, scene.objects["part_1"].id) == ("labels.npz", 1)
     inputs = read_inputs(msgspec.structs.replace(scene, input=msgspec.structs.replace(scene.input, max_size=16)))
     assert inputs.views.masks is None
     assert (np.asarray(segment(scene, inputs).object_id) == 1).all()
+
+
+def test_a_true_height_gives_the_scale_of_scene_and_comments(tmp_path, monkeypatch):
+    """By the option or by an answer: the ball of 0.6 units is 30 cm tall in the plan, and lengths are halved."""
+    io.save_ply(tmp_path / "ball.ply", splats(sphere(np.array([1.0, 2, 5]), 0.3, 900, np.random.default_rng(2))))
+    monkeypatch.setattr("pigjax.cli.drafting.thumbnails", lambda _: {})
+    asked = []
+    plain = write_draft(find_parts(tmp_path / "ball.ply"), tmp_path / "asked", up="z", ask_height=lambda name, units: (
+        asked.append((name, units)), "")[1])  # fmt: skip
+    assert asked == [("part_1", pytest.approx(0.6, rel=0.03))]
+    told = new(tmp_path / "ball.ply", "-o", tmp_path / "scene", "--up", "z", "--height", "30 cm")
+    assert told.exit_code == 0, told.output
+    text = (tmp_path / "scene" / "scene.toml").read_text()
+    answer = write_draft(
+        find_parts(tmp_path / "ball.ply"), tmp_path / "scene", up="z", ask_height=lambda *_: "30 cm"
+    ).text
+    assert answer == text
+
+    def radius(text):
+        return float(re.search(r"^# radius = (\S+) # m", text, re.M)[1])
+
+    assert radius(text) / radius(plain.text) == pytest.approx(0.5, rel=0.03)  # three digits, and ends of the ball
+    scene = load_scene(tmp_path / "scene" / "scene.toml")
+    assert scene.objects["part_1"].height == "30 cm"
+    x = np.asarray(read_inputs(scene).gaussians.means)
+    assert np.ptp(x[:, 2]) == pytest.approx(0.3, rel=0.03)
+    assert x[:, 2].min() == pytest.approx(0, abs=0.005)
+    assert "write a length with its unit" in str(
+        new(tmp_path / "ball.ply", "--height", "3", "-o", tmp_path / "b").exception
+    )
 
 
 @pytest.mark.parametrize("suffix", SPLAT_SUFFIXES)

@@ -46,6 +46,23 @@ class Opened:
     read: Inputs | None = None  # files of the scene; None: of a run, which reads them when they are needed
     labels: Labels | None = None  # as lifted
     notes: list[str] = field(default_factory=list)
+    joined: bool = False  # whether its splats lie in several files, and are in one only where `write_joined` put it
+
+    def write_joined(self) -> None:
+        """Write the splats and their objects as the files that the values of the scene name.
+
+        Raises:
+            InputError: they cannot be written.
+        """
+        assert self.read is not None
+        assert self.labels is not None
+        spec = self.values["input"]
+        io.save_ply(self.folder / spec["gaussians"], self.read.gaussians, origin=spec.get("origin"))
+        mark = None if "origin" in spec else io.digest_of_scene(self.read.gaussians)
+        labels = self.labels
+        io.save_labels(
+            self.folder / spec["labels"], labels.object_id, labels.votes, labels.confidence, labels.ids, scene=mark
+        )
 
     def prepared(self, scene: Scene) -> tuple[Scene, Inputs, Labels]:
         """What `make_plan` needs, for the objects of a scene.
@@ -59,7 +76,8 @@ class Opened:
         assert self.labels is not None
         named = {name: number for number, name in self.names.items()} | self.read.ids
         ids = {name: named.get(name, -1) if spec.id is None else spec.id for name, spec in scene.objects.items()}
-        return arrange(scene, replace(self.read, ids=ids), self.labels)
+        own = {self.names.get(self.read.ids[name], name): cloud for name, cloud in self.read.own.items()}
+        return arrange(scene, replace(self.read, ids=ids, own=own), self.labels)
 
 
 def open_path(
@@ -90,7 +108,11 @@ def open_path(
     if path.suffix == ".toml":
         return _open_scene(read_file(path, "scene file"), path.parent, path.name, accuracy, tell)
     if (path / "states").is_dir() and (path / "scene.toml").is_file():
-        return _open_run(path)
+        if io.state_frames(path / "states"):
+            return _open_run(path)
+        opened = _open_scene(read_file(path / "scene.toml", "scene file"), path, path.name, accuracy, tell)
+        opened.notes.append("this run keeps no states, or has none yet: play simulates its scene from the start")
+        return opened
     if (path / "labels.npz").is_file() and (path / "objects").is_dir():
         return _open_segments(path, drop_invalid, up or "z")
     if (path / "scene.toml").is_file():
@@ -159,21 +181,27 @@ def _of_splats(
 def _open_segments(path: Path, drop_invalid: bool, up: Up) -> Opened:
     """The objects of `pigjax segment`, joined again."""
     clouds, ids, names = [], [], {}
+    origin: tuple[float, float, float] | None = None
     for file in sorted((path / "objects").glob("*.ply")):
         number, _, name = file.stem.partition("_")
         if not (number.isdecimal() or number == "unseen"):
             continue
-        clouds.append(io.load_gaussians(file, drop_invalid=drop_invalid, origin=io.origin_of(file)))
+        origin = origin or io.origin_of(file)  # of the first, for all: they are parts of one scene
+        clouds.append(io.load_gaussians(file, drop_invalid=drop_invalid, origin=origin))
         ids.append(np.full(len(clouds[-1]), -1 if number == "unseen" else int(number), np.int32))
-        if name:
-            names[int(number)] = name
+        if ids[-1][0] > 0:
+            names[int(number)] = name or f"object-{int(number)}"
     if not clouds:
         raise InputError(f"{path / 'objects'}: no object in it; run 'pigjax segment' again.")
     widest = max(cloud.sh.shape[1] for cloud in clouds)
     gaussians = jax.tree.map(lambda *parts: jnp.concatenate(parts), *(_widened(cloud, widest) for cloud in clouds))
-    values = new_values(gaussians, "gaussians.ply", names, up)
-    note = "a scene file needs the photos and masks that these objects came from: add input.views"
-    return _of_splats(path.name, path, gaussians, np.concatenate(ids), names, values, [note])
+    values = new_values(gaussians, "joined.ply", names, up)
+    values["input"]["labels"] = "joined-labels.npz"
+    if origin and any(origin):
+        values["input"]["origin"] = list(origin)
+    opened = _of_splats(path.name, path, gaussians, np.concatenate(ids), names, values, [])
+    opened.joined = True
+    return opened
 
 
 def _widened(gaussians: Gaussians, bands: int) -> Gaussians:
