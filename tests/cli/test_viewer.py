@@ -15,7 +15,7 @@ from pigjax.cli.viewer.draft import Draft
 from pigjax.cli.viewer.opened import open_path
 from pigjax.cli.viewer.page import Page
 from pigjax.cli.viewer.picking import pick_splat
-from pigjax.cli.viewer.server import _is_local, refused
+from pigjax.cli.viewer.server import _is_local, refused, start_server
 from pigjax.cli.viewer.session import Session
 from pigjax.cli.viewer.solids import pose_of, shape_of
 from pigjax.core.errors import InputError, MissingFileError, SceneError
@@ -290,6 +290,53 @@ def test_what_others_refer_to_stays_and_taken_names_are_refused(poured):
         assert poured.scene() == before
 
 
+@pytest.fixture
+def serve():
+    """Pages without a browser, whose controls are set and called as the page's thread does it."""
+    pytest.importorskip("viser")
+    pages = []
+
+    def begin(path):
+        pages.append(Page(Session(open_path(path)), start_server(port=0)))
+        return pages[-1]
+
+    yield begin
+    for page in pages:
+        page.close()
+
+
+def test_controls_show_the_former_value_where_a_change_is_refused(folder, serve):
+    page = serve(folder / "scene.toml")
+    before = page.session.draft.scene()
+    for control, value, act in (
+        (page.role, "fixed", page._set_role),  # nothing else moves
+        (page.role, "not in the scene", page._set_role),
+        (page.value, -1.0, page._set_number),
+        (page.velocity, (1e9, 0.0, 0.0), page._set_velocity),
+        (page.gravity, (0.0, 0.0, 1e30), page._set_gravity),
+        (page.name, " ", page._rename),
+    ):
+        was = control.value
+        control.value = value
+        with pytest.raises(InputError):
+            act()
+        assert control.value == was
+    page.session.opened.names[9] = "hat"
+    page.name.value = "hat"
+    with pytest.raises(InputError, match="hat: is the name of another object"):
+        page._rename()
+    assert page.session.draft.scene() == before
+    page.name.value = "melon"
+    page._rename()
+    page.role.value = "sand"
+    page._set_role()
+    assert page.session.draft.scene().objects["melon"].material == "sand"
+    assert (page.object.value, page.role.value) == ("1: melon", "sand")
+    page.ground.value = True
+    page._set_ground()
+    assert page.session.ground == pytest.approx(page.session.bottom, abs=1e-3)
+
+
 def test_the_ground_begins_under_the_scene_whatever_is_up(folder):
     opened = open_path(folder / "cloud.ply", up=(0.6, -0.8, 0.0))
     means = np.asarray(opened.gaussians.means)
@@ -415,14 +462,17 @@ def test_a_run_without_states_opens_as_its_scene(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_frames_of_a_run_are_there_again_after_a_live_simulation(finished):
-    session = Session(open_path(finished))
-    session.show_frame(2)
+def test_the_frames_of_a_run_are_there_again_after_a_live_simulation(finished, serve):
+    page = serve(finished)
+    session = page.session
+    page._go_to(2)
     before = session.shown(1)
-    session.start_live()
+    page._switch()
     assert session.live is not None
-    session.stop_live()
-    session.show_frame(2)
+    assert (page.time.visible, page.simulate.label) == (False, "frames of the run")
+    page._switch()
+    assert (session.live, session.frame) == (None, 2)
+    assert (page.time.visible, page.simulate.label) == (True, "simulate live")
     after = session.shown(1)
     for was, now in zip(before, after):
         np.testing.assert_array_equal(was, now)
