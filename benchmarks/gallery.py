@@ -17,22 +17,25 @@ from benchmarks.common.command import start_worker
 from benchmarks.common.kept import commit, fingerprint, kept_row
 from benchmarks.common.pages import EXAMPLES, ROOT, head, row
 from benchmarks.common.timing import peak_memory
-from benchmarks.media import write_sheet
-from pigjax.io import read_toml
+from benchmarks.media import tiles, write_sheet
+from pigjax.io import contact_sheet, read_toml, write_image
 from pigjax.scene import run_scene, scene_from
 
 SCENES = {path.stem: path for path in sorted((EXAMPLES / "gallery").glob("*.toml"))}
 FILES = ("gaussians", "views", "labels", "names")  # entries of a scene's `input`
-HEADER = head("scene", "shows", "processor s", "GB", "particles", "frames", "substeps", "least J", "code", "notes")
+THUMBNAIL = 90  # height of the pictures beside a row [px]
+HEADER = head(
+    "pictures", "scene", "shows", "processor s", "GB", "particles", "frames", "substeps", "least J", "code", "notes"
+)
 
 
 def gallery(options) -> None:
-    """Run the scenes, and draw the sheet of those that have a clip."""
+    """Run the scenes, draw the sheet of those that have a clip, and three pictures beside each row."""
     print(HEADER)
     for name in options.scenes:
         path = SCENES[name]
         if missing := [part for part in parts_of(path) if not located(path, part, options.data).is_file()]:
-            print(row(name, told(path)[0], *[""] * 7, f"skipped: no {missing[0]}; {data_of(path)}"))
+            print(row("", name, told(path)[0], *[""] * 7, f"skipped: no {missing[0]}; {data_of(path)}"))
             continue
         files = [path, *(located(path, part, options.data) for part in parts_of(path))]
 
@@ -43,11 +46,26 @@ def gallery(options) -> None:
 
         kept = options.out / name / "row.json"
         line = kept_row(kept, [fingerprint(files, path.parent), options.accuracy], make)
-        print(line or row(name, told(path)[0], *[""] * 7, "failed"), flush=True)
+        line = line or row(name, told(path)[0], *[""] * 7, "failed")
+        print(
+            row(thumbnail(name, options.out / name / "video.mp4", options.media)) + line.removeprefix("|"), flush=True
+        )
     clips = {name: options.out / name / "video.mp4" for name in SCENES}
     there = {name: iio.imread(clip) for name, clip in clips.items() if clip.is_file()}
     if there:
         write_sheet(there, options.media / "gallery.png")
+
+
+def thumbnail(name: str, clip: Path, media: Path) -> str:
+    """The first, the middle and the last picture of a clip as a JPEG, in Markdown; empty where there is no clip."""
+    if not clip.is_file():
+        return ""
+    frames = iio.imread(clip)
+    height, width = frames.shape[1:3]
+    pictures = tiles(frames, 3, (round(THUMBNAIL * width / height), THUMBNAIL), name, named=0)
+    path = media / f"gallery_{name}.jpg"
+    write_image(path, contact_sheet(pictures, 3, gap=2))
+    return f"![{name}]({Path(os.path.relpath(path, EXAMPLES / 'gallery')).as_posix()})"
 
 
 def worker(name: str, out: str, data: str, accuracy: str) -> None:

@@ -14,14 +14,25 @@ from pigjax.scene.draft import Draft, draft_scene, thumbnails
 MASK_LAYOUT = "object_mask/<photo's name>.png with 8- or 16-bit ids: 0 background, one id an object in all photos"
 
 
-def write_draft(found: Found, folder: Path, *, up: str | None, ask: Callable[[str], str] | None) -> Draft:
+def write_draft(
+    found: Found,
+    folder: Path,
+    *,
+    up: str | None = None,
+    height: str | None = None,
+    ask_up: Callable[[str], str] | None = None,
+    ask_height: Callable[[str, float], str] | None = None,
+) -> Draft:
     """Draft a scene, and write scene.toml, labels.npz where they are needed, and a thumbnail of each object. Host.
 
     Args:
         found: the parts of the capture; Gaussians must be among them.
         folder: for the scene.
         up: axis that points up; None: guessed.
-        ask: asked for the axis with the guess, where someone can answer; None: the guess counts.
+        height: true height of the tallest object that moves, as "30 cm"; None: lengths of the files are metres.
+        ask_up: asked for the axis with the guess, where someone can answer; None: the guess counts.
+        ask_height: asked for the height with the name of that object and its height in the files; an empty answer is
+            None.
 
     Raises:
         InputError: as `draft_scene`, or a file cannot be written.
@@ -29,14 +40,17 @@ def write_draft(found: Found, folder: Path, *, up: str | None, ask: Callable[[st
     if (splats := found.gaussians) is None:
         raise InputError("a draft needs trained splats.")
 
-    def drafted(up: str | None) -> Draft:
+    def drafted(up: str | None, height: str | None) -> Draft:
         return draft_scene(
-            splats, folder, views_path=found.views, masks_path=found.masks, names_path=found.names, up=up
+            splats, folder, views_path=found.views, masks_path=found.masks, names_path=found.names, up=up, height=height
         )
 
-    draft = drafted(up)
-    if ask is not None and (answer := ask(draft.up)) != draft.up:
-        draft = drafted(answer)
+    draft = drafted(up, height)
+    if ask_up is not None and (answer := ask_up(draft.up)) != draft.up:
+        up = answer
+        draft = drafted(up, height)
+    if ask_height is not None and (answer := ask_height(draft.tallest.name, draft.tallest.height).strip()):
+        draft = drafted(up, answer)
     if (labels := draft.labels) is not None:
         io.save_labels(folder / "labels.npz", labels.object_id, labels.votes, labels.confidence, scene=draft.mark)
     for name, picture in thumbnails(draft).items():

@@ -194,7 +194,7 @@ def _settings(tau_t: float, tau_d: float, weighting: str, purity: float, min_see
 
 @app.command()
 def segment(
-    gaussians: Annotated[Path, typer.Argument(help="Trained .ply, .splat or .spz.")],
+    gaussians: Annotated[Path, typer.Argument(help="Trained splats: .ply, .splat, .spz, .sog, .glb, USD.")],
     views: Annotated[
         Path | None, typer.Argument(help="Posed photos with a folder object_mask beside them; not needed by --select.")
     ] = None,
@@ -286,7 +286,7 @@ def _tell_objects(counts: dict[int, int], names: dict[int, str], out: Path) -> N
 @app.command()
 def evaluate(
     dataset: Annotated[Path, typer.Argument(help="Folder of a labelled scene.")],
-    gaussians: Annotated[Path, typer.Argument(help="Trained .ply, .splat or .spz of it.")],
+    gaussians: Annotated[Path, typer.Argument(help="Its trained splats: .ply, .splat, .spz, .sog, .glb, USD.")],
     layout: Annotated[str, typer.Option("--format", help="lerf-mask, 3d-ovs, or views.")],
     out: Out = Path("evaluation"),
     images: Images = None,

@@ -136,7 +136,10 @@ def _run(
 @app.command()
 def view(
     path: Annotated[
-        Path, typer.Argument(help="A .ply, .splat or .spz, a scene file, or the folder of a run or of 'segment'.")
+        Path,
+        typer.Argument(
+            help="Splats (.ply, .splat, .spz, .sog, .glb, USD), a scene file, folder of a run or of 'segment'."
+        ),
     ],
     out: File = None,
     host: Annotated[str, typer.Option(help="Address to listen on; the default is this machine alone.")] = "127.0.0.1",
@@ -236,7 +239,9 @@ def _open_page(
 
 @app.command()
 def info(
-    path: Annotated[Path, typer.Argument(help="A .ply, .splat or .spz, a scene file, or posed photos.")],
+    path: Annotated[
+        Path, typer.Argument(help="Splats (.ply, .splat, .spz, .sog, .glb, USD), a scene file, or posed photos.")
+    ],
     images: Images = None,
 ) -> None:
     """Say what a file holds: sizes, lenses, which way is up, the dense core and what lies outside of it."""

@@ -21,6 +21,7 @@ from pigjax.core.gaussians import SH_CONSTANT
 from pigjax.core.harmonics import sh_degree_of
 from pigjax.core.upright import find_up
 from pigjax.io.files import existing
+from pigjax.io.formats import SPLAT_SUFFIXES
 from pigjax.objects.association import associate_masks
 from pigjax.objects.boundaries import refit_boundaries
 from pigjax.objects.editing import extract_object, hole_mask, remove_object
@@ -206,7 +207,7 @@ def describe_file(path: Path, *, images: Path | None = None) -> dict[str, str]:
         InputError: it is damaged, or of no known kind.
     """
     existing(path, "file or folder")
-    if path.suffix.lower() in (".ply", ".splat", ".spz"):
+    if path.suffix.lower() in SPLAT_SUFFIXES:
         origin = io.origin_of(path)
         described = _describe_gaussians(io.read_gaussians(path, drop_invalid=True, origin=origin))
         far = {"origin": ", ".join(f"{value:.12g}" for value in origin) + " m, which centres are counted from"}

@@ -13,10 +13,14 @@ from pigjax.core.errors import InputError
 
 _UP = "Direction that points up: x, y, z, -x, -y, -z, or 'X Y Z'; from cameras or ground if not given."
 
+_HEIGHT = "True height of the tallest object that moves, as '30 cm': the scale; lengths are metres if not given."
+
 
 @app.command()
 def new(
-    source: Annotated[Path, typer.Argument(help="Trained .ply, .splat, .spz; posed photos, or the folder of all.")],
+    source: Annotated[
+        Path, typer.Argument(help="Trained .ply, .splat, .spz, .sog, .glb, USD; posed photos; or the folder.")
+    ],
     out: Annotated[
         Path | None,
         typer.Option(
@@ -32,6 +36,7 @@ def new(
     masks: Annotated[Path | None, typer.Option(help="Instance masks, if they lie elsewhere.")] = None,
     names: Annotated[Path | None, typer.Option(help="JSON of mask ids and names, if it lies elsewhere.")] = None,
     up: Annotated[str | None, typer.Option(help=_UP)] = None,
+    height: Annotated[str | None, typer.Option(help=_HEIGHT)] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Write a scene file to edit: up, ground, objects with pictures and materials; say what is missing."""
@@ -60,7 +65,11 @@ def new(
     for name in ("scene.toml", "labels.npz"):
         if (folder / name).exists() and not overwrite:
             raise InputError(f"{folder / name}: exists; give --overwrite to replace it, or another -o.")
-    draft = write_draft(found, folder, up=up, ask=_ask if sys.stdin.isatty() and up is None else None)
+    answers = sys.stdin.isatty()
+    draft = write_draft(
+        found, folder, up=up, height=height, ask_up=_ask_up if answers and up is None else None,
+        ask_height=_ask_height if answers and height is None else None,
+    )  # fmt: skip
     for remark in draft.remarks:
         console.print(said(remark, label="note: ", style="yellow"), soft_wrap=True)
     for part in draft.parts:
@@ -74,6 +83,12 @@ def new(
     console.print(said(f"pigjax run {folder / 'scene.toml'} -o {folder / 'out'}"), soft_wrap=True)
 
 
-def _ask(guess: str) -> str:
+def _ask_up(guess: str) -> str:
     """The direction that points up, from who sits at the terminal."""
     return typer.prompt("Which direction points up (x, y, z, -x, -y, -z, or three numbers)?", default=guess, err=True)
+
+
+def _ask_height(name: str, units: float) -> str:
+    """The true height of an object; empty where the files are in metres."""
+    told = f"True height of {name}, as 30 cm? It is {units:.3g} units tall; with Enter a unit is a metre"
+    return typer.prompt(told, default="", show_default=False, err=True)

@@ -9,11 +9,13 @@ from typing import NamedTuple
 from pigjax.core.errors import InputError
 from pigjax.io.cameras import load_cameras
 from pigjax.io.files import PathLike, existing
-from pigjax.io.formats import load_gaussians
+from pigjax.io.formats import SPLAT_SUFFIXES, load_gaussians
 
-SPLATS = (".ply", ".splat", ".spz", ".sog")
 PHOTOS = (".jpg", ".jpeg", ".png", ".webp")
-_TRAINED = ("*.ply", "*.splat", "*.spz", "point_cloud/iteration_*/point_cloud.ply", "*/gaussians.ply", "*/splat.ply")
+_TRAINED = (
+    *(f"*{suffix}" for suffix in SPLAT_SUFFIXES), "point_cloud/iteration_*/point_cloud.ply", "*/gaussians.ply",
+    "*/splat.ply",
+)  # fmt: skip
 _PHOTO_FOLDERS = (".", "images", "input", "photos", "rgb")
 _MASK_FOLDERS = ("object_mask", "masks", "mask", "segmentation", "Annotations")
 _MOST_TRIED = 24  # files that are opened to see whether they hold Gaussians
@@ -36,13 +38,14 @@ def find_parts(path: PathLike) -> Found:
     Of several trained files the one of the longest training counts (`iteration_30000`), else the newest.
 
     Args:
-        path: a `.ply`, `.splat`, `.spz` or `.sog`; `transforms.json` or `cameras.json`; or a folder.
+        path: a file of Gaussians, of any kind that `load_gaussians` reads; `transforms.json` or `cameras.json`; or a
+            folder.
 
     Raises:
         MissingFileError: there is nothing at the path.
     """
     path = existing(path, "file or folder")
-    if path.is_file() and path.suffix.lower() in SPLATS:
+    if path.is_file() and path.suffix.lower() in SPLAT_SUFFIXES:
         return Found(path, None, None, None, 0, None)
     folder = path if path.is_dir() else path.parent
     views: Path | None = path

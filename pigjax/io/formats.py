@@ -60,7 +60,7 @@ def read_gaussians(
     if suffix not in _READERS:
         if suffix == ".ksplat":
             raise InputError(f"{path}: .ksplat is not read; save it as .ply (by SuperSplat or splat-transform).")
-        raise InputError(f"{path}: unknown kind of file '{suffix}'; give a .ply, {', '.join(_READERS)}.")
+        raise InputError(f"{path}: unknown kind of file '{suffix}'; give one of {', '.join(SPLAT_SUFFIXES)}.")
     return gaussians_of(path, _READERS[suffix](path), drop_invalid=drop_invalid, origin=origin)
 
 
@@ -117,3 +117,4 @@ _READERS: dict[str, Callable[[PathLike], dict[str, np.ndarray]]] = {
     ".glb": read_glb,
     **dict.fromkeys(SUFFIXES, read_usd),
 }
+SPLAT_SUFFIXES = (".ply", *_READERS)  # of the files that `load_gaussians` reads

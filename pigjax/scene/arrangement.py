@@ -78,7 +78,7 @@ def _placed(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scene, Inputs
             parts.append(here)
             owners.append(ids[name])
         for k, shift in enumerate(entry.copies, 1):
-            copy = f"{name}-{k}"
+            copy = name_of_copy(name, k)
             if copy in objects:
                 raise SceneError(
                     f"{joined('objects', copy)}: is the name of a copy of objects.{name}; name it otherwise."
@@ -216,6 +216,11 @@ def _without_removed(scene: Scene, inputs: Inputs, labels: Labels) -> tuple[Scen
         own={name: cloud for name, cloud in inputs.own.items() if name in there},
     )
     return with_fields(scene, objects=there), inputs, replace(labels, **own)
+
+
+def name_of_copy(name: str, number: int) -> str:
+    """Name of a copy of an object, numbered from 1."""
+    return f"{name}-{number}"
 
 
 def placement(gaussians: Gaussians, entry: ObjectSpec, name: str) -> Float[np.ndarray, "4 4"]:

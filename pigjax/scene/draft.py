@@ -25,7 +25,7 @@ from pigjax.core.upright import find_up, spreads_wider
 from pigjax.coupling.solid import large_parts, parts_of
 from pigjax.mpm.materials import PRESETS
 from pigjax.objects.lifting import lift
-from pigjax.scene.world import AXES, axis_of, placed_cameras
+from pigjax.scene.world import AXES, axis_of, height_of, metres_of, placed_cameras
 from pigjax.segmentation import Labels
 from pigjax.splat import Gaussians, RenderConfig, render
 from pigjax.splatting.types import extent_of
@@ -58,6 +58,11 @@ class Part:
         sides = self.high - self.low
         return float(np.prod(np.maximum(sides, 0.05 * sides.max())) ** (1 / 3))
 
+    @property
+    def height(self) -> float:
+        """Of its box [m]."""
+        return float(self.high[2] - self.low[2])
+
 
 @dataclass
 class Draft:
@@ -72,6 +77,11 @@ class Draft:
     up: str  # of the files: the name of an axis, or three numbers
     remarks: list[str] = field(default_factory=list)  # guesses and gaps, each with its remedy
 
+    @property
+    def tallest(self) -> Part:
+        """Of the objects that move, the one whose true height is asked for."""
+        return _tallest(self.parts)
+
 
 def draft_scene(
     gaussians_path: Path,
@@ -81,6 +91,7 @@ def draft_scene(
     masks_path: Path | None = None,
     names_path: Path | None = None,
     up: str | None = None,
+    height: str | None = None,
 ) -> Draft:
     """Draft a scene for Gaussians, with posed photos and masks where there are any.
 
@@ -92,9 +103,12 @@ def draft_scene(
         names_path: JSON of mask ids and names.
         up: direction of the files that points up: x, y, z, -x, -y, -z, or three numbers; None: from the cameras, else
             from the ground.
+        height: true height of the tallest object that moves, with its unit, as "30 cm": gives the scale of the scene,
+            which photos alone cannot; None: lengths of the files are taken for metres.
 
     Raises:
-        InputError: a file is damaged, the direction is none, or no part of the scene is large enough for an object.
+        InputError: a file is damaged, the direction or the height is none, or no part of the scene is large
+            enough for an object.
     """
     given = None if up is None else axis_of(_direction(up))
     gaussians, dropped = io.read_gaussians(gaussians_path, drop_invalid=True)
@@ -118,21 +132,29 @@ def draft_scene(
         parts = _masked_parts(gaussians, here, views, names)
     else:
         ground = ground_height(np.asarray(here.means, np.float64)[extent.core], _Z)
-        parts, labels = _connected_parts(here, extent.core, ground)
+        parts, labels = _connected_parts(here, extent.core, ground, has_views=views is not None)
         remarks.append(
             "no masks: objects are the connected parts above the ground; for other ones give"
             " objects.<name>.within = { lower = [x, y, z], upper = [x, y, z] }, or masks of posed photos."
         )
     _mark_supports(parts)
-    height = min(float(part.low[2]) for part in parts) if ground is None else ground
-    middle = np.dot(world[:3, :3], extent.centre) * [1, 1, 0] + [0, 0, height]
+    foot = min(float(part.low[2]) for part in parts) if ground is None else ground
+    middle = np.dot(world[:3, :3], extent.centre) * [1, 1, 0] + [0, 0, foot]
     origin = np.dot(world[:3, :3].T, middle)
     world[:3, 3] = -middle
+    tallest = _tallest(parts)
+    scale = (
+        1.0 if height is None else metres_of(height, "height") / height_of(here, np.flatnonzero(tallest.members), _Z)
+    )
+    world[:3] *= scale
     for part in parts:
-        part.low, part.high = part.low - middle, part.high - middle
+        part.low, part.high = scale * (part.low - middle), scale * (part.high - middle)
     sources = _Sources(gaussians_path, views_path, masks_path, names_path, folder, drops=dropped > 0)
-    heights = np.asarray(here.means, np.float64)[_tallest(parts).members, 2] - middle[2]
-    text = _text(sources, parts, labels is not None, given, origin, ground is not None, extent.radius, remarks, heights)
+    heights = scale * (np.asarray(here.means, np.float64)[tallest.members, 2] - middle[2])
+    text = _text(
+        sources, parts, labels is not None, given, origin, ground is not None, scale * extent.radius, remarks, heights,
+        height,
+    )  # fmt: skip
     return Draft(
         text=text,
         parts=parts,
@@ -264,9 +286,12 @@ def _masked_parts(gaussians: Gaussians, here: Gaussians, views: io.Views, names:
 
 
 def _connected_parts(
-    gaussians: Gaussians, core: Bool[np.ndarray, "n"], ground: float | None
+    gaussians: Gaussians, core: Bool[np.ndarray, "n"], ground: float | None, *, has_views: bool
 ) -> tuple[list[Part], Labels | None]:
-    """Parts above the ground, the largest first, and the labels that say so; a single one without a ground has none."""
+    """Parts above the ground, the largest first, and the labels that say so.
+
+    A single one without a ground needs none, unless there are photos, of which a scene without labels wants masks.
+    """
     means = np.asarray(gaussians.means, np.float64)
     heights = np.where(core, means[:, 2], -np.inf)
     free = core.copy()
@@ -287,7 +312,7 @@ def _connected_parts(
         object_id[:] = 1
     count = min(len(kept), _MOST_PARTS)
     parts = [_part(f"part_{k}", k, (object_id == k) & core, means) for k in range(1, count + 1)]
-    if ground is None and count == 1:
+    if ground is None and count == 1 and not has_views:
         return parts, None
     votes = np.zeros((len(means), count + 1), np.int32)
     votes[np.arange(len(means)), object_id] = 1
@@ -372,10 +397,11 @@ def _text(
     radius: float,
     remarks: list[str],
     heights: Float[np.ndarray, "n"],
+    height: str | None,
 ) -> str:
     dx = _rounded(min(part.size for part in parts if not part.fixed) / _CELLS)
     tallest = _tallest(parts)
-    tall = float(tallest.high[2] - tallest.low[2])
+    tall = tallest.height
     held, why = _foot(heights, float(tallest.low[2]), tall)
     name = _name_of(up)
     direction = _quoted(name) if name in AXES else f"[{name}]"
@@ -387,9 +413,7 @@ def _text(
         "[input]",
         *sources.lines(labelled),
         "",
-        "# This file is in metres, z up, and 0 on the ground. Cameras of COLMAP have no scale: give the true height of",
-        f'# one object, as height = "30 cm" in objects.{_key(tallest.name)} ({tall:.3g} units tall here); lengths',
-        "# below are then to be scaled likewise.",
+        *_scale_lines(tallest.name, tall, height),
         "[world]",
         f"up = {direction} # direction of the files that points up: x, y, z, -x, -y, -z, or three numbers",
         f"origin = [{middle}] # point of the files that is 0 here",
@@ -405,7 +429,8 @@ def _text(
         "",
     ]
     for part in parts:
-        lines += _object_lines(part, needs_id=labelled or (sources.views is not None and not part.is_known))
+        needs_id = labelled or (sources.views is not None and not part.is_known)
+        lines += _object_lines(part, needs_id=needs_id, height=height if part is tallest else None)
     lines += [
         f"[planes.ground] # {'the layer of splats at the lower end' if is_ground else 'below all objects'}",
         "point = [0, 0, 0] # m",
@@ -436,9 +461,22 @@ def _text(
     return "\n".join(lines)
 
 
+def _scale_lines(name: str, tall: float, height: str | None) -> list[str]:
+    """Comments on the unit of length."""
+    if height is not None:
+        return [
+            f"# This file is in metres, z up, and 0 on the ground; the height of objects.{_key(name)} gives the scale."
+        ]
+    return [
+        "# This file is in metres, z up, and 0 on the ground. Cameras of COLMAP have no scale: give the true height of",
+        f'# one object, as height = "30 cm" in objects.{_key(name)} ({tall:.3g} units tall here); lengths',
+        "# below are then to be scaled likewise. `pigjax new --height` does both.",
+    ]
+
+
 def _tallest(parts: list[Part]) -> Part:
     """Of the parts that move."""
-    return max((part for part in parts if not part.fixed), key=lambda part: part.high[2] - part.low[2])
+    return max((part for part in parts if not part.fixed), key=lambda part: part.height)
 
 
 def _foot(heights: Float[np.ndarray, "n"], low: float, tall: float) -> tuple[float, str]:
@@ -449,12 +487,13 @@ def _foot(heights: Float[np.ndarray, "n"], low: float, tall: float) -> tuple[flo
     return low + 0.15 * tall, "a guess: 15 % of its height"
 
 
-def _object_lines(part: Part, *, needs_id: bool) -> list[str]:
+def _object_lines(part: Part, *, needs_id: bool, height: str | None) -> list[str]:
     size = " x ".join(f"{side:.3g}" for side in part.high - part.low)
     picture = io.safe_name(part.name)
     lines = [
         f"[objects.{_key(part.name)}] # {int(part.members.sum())} splats, {size} m; see thumbnails/{picture}.png",
         *([f"id = {part.id}"] if needs_id else []),
+        *([] if height is None else [f"height = {_quoted(height)} # true height: gives the scale of the whole scene"]),
     ]
     if part.fixed:
         return [*lines, "fixed = true # carries the others: a collider made from its splats", "friction = 0.5", ""]

@@ -14,9 +14,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pigjax import io
+from pigjax.scene.arrangement import name_of_copy
 from pigjax.scene.forces import WindSpec
 from pigjax.scene.report import RunReport
-from pigjax.scene.schema import Scene
+from pigjax.scene.schema import ObjectSpec, Scene
 
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 460, 200, 64, 12, 10, 34  # of a chart [px]
 _COLOURS = ("#1f6fb2", "#c2571a", "#2f8f4e", "#8a4fb0")
@@ -75,9 +76,9 @@ def report_page(
 
 def left_out(scene: Scene, report: RunReport) -> list[str]:
     """What the run does not model, with the setting that would where there is one."""
-    spec, moving = scene.simulation, sum(not entry.fixed for entry in scene.objects.values())
+    spec, moving = scene.simulation, [entry for _, entry in _listed(scene) if entry.moves]
     found = []
-    if moving > 1 and scene.contact_friction is None:
+    if len(moving) > 1 and spec.contact_friction is None and not any(entry.rigid for entry in moving):
         found.append(
             "Contact between objects: they share one velocity field and stick where they touch"
             " (simulation.contact_friction parts them)."
@@ -124,13 +125,21 @@ def _objects(scene: Scene, report: RunReport) -> str:
     rows = [
         (
             name,
-            "fixed" if entry.fixed else entry.material or entry.model or "",
+            "removed" if entry.removed else "fixed" if entry.fixed else entry.material or entry.model or "",
             gaussians.get(name, ""),
             particles.get(name, ""),
         )
-        for name, entry in scene.objects.items()
+        for name, entry in _listed(scene)
     ]
     return _rows(("object", "material", "Gaussians", "particles"), rows)
+
+
+def _listed(scene: Scene) -> Iterable[tuple[str, ObjectSpec]]:
+    """Objects with their copies, then volumes, by the names that they have in a run."""
+    for name, entry in scene.objects.items():
+        yield name, entry
+        yield from ((name_of_copy(name, k), entry) for k in range(1, len(entry.copies) + 1))
+    yield from scene.volumes.items()
 
 
 def _times(report: RunReport) -> str:

@@ -1,7 +1,7 @@
 """The logic of `pigjax view` without a browser: opening, picking, posing, colours, scene file, live simulation."""
 
 from dataclasses import replace
-from types import SimpleNamespace
+from types import MethodType, SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,13 +14,14 @@ from pigjax.cli.viewer.colouring import scale_end, strain_of, value_colours
 from pigjax.cli.viewer.draft import Draft
 from pigjax.cli.viewer.opened import open_path
 from pigjax.cli.viewer.page import Page
-from pigjax.cli.viewer.picking import pick_particle, pick_splat
-from pigjax.cli.viewer.server import _is_local, refused
+from pigjax.cli.viewer.picking import pick_splat
+from pigjax.cli.viewer.server import _is_local, refused, start_server
 from pigjax.cli.viewer.session import Session
 from pigjax.cli.viewer.solids import pose_of, shape_of
 from pigjax.core.errors import InputError, MissingFileError, SceneError
 from pigjax.mpm.colliders import Box, Capsule, Cylinder, Plane, SampledDistance, Sphere
 from pigjax.scene import load_scene, run_scene
+from pigjax.scene.plan import read_inputs, segment
 from pigjax.splat import Gaussians
 
 
@@ -56,13 +57,6 @@ def test_a_flat_splat_is_met_where_the_ray_crosses_its_plane():
     normal = tilt[:, 2]
     wanted = normal[2] * 2 / normal[2] - 0.1 * normal[0] / normal[2]
     assert hit.depth == pytest.approx(wanted, abs=1e-4)
-
-
-def test_a_ray_picks_the_particle_that_it_meets_first():
-    x = np.array([[0, 0.05, 1.0], [0, 0, 2.0], [0, 0.3, 0.5], [np.nan, 0, 1]])
-    hit = pick_particle(x, 0.1, np.zeros(3), np.array([0, 0, 1.0]))
-    assert (hit.row, hit.depth) == (0, 1.0)
-    assert pick_particle(x, 0.01, np.array([0, 1.0, 0]), np.array([0, 0, 1.0])) is None
 
 
 # colours and colliders
@@ -146,6 +140,13 @@ def test_splats_labels_scenes_and_folders_are_told_apart(folder, tmp_path):
     segments = open_path(tmp_path)
     assert len(segments.gaussians) == 87
     assert segments.names == {7: "red_cube"}
+    draft = Session(segments).draft
+    draft.set_number("red_cube", "young", 2e4)
+    scene = load_scene(draft.write("mine"))
+    inputs = read_inputs(scene)
+    found = np.asarray(segment(scene, inputs).object_id)
+    assert np.bincount(found)[[0, 7]].tolist() == [40, 47]
+    np.testing.assert_array_equal(inputs.gaussians.means, segments.gaussians.means)
     with pytest.raises(MissingFileError):
         open_path(tmp_path / "nothing")
     with pytest.raises(InputError, match="nothing to show in it"):
@@ -186,7 +187,10 @@ def test_a_draft_refuses_what_a_scene_cannot_be_and_stays_as_it_was(folder):
         (lambda: draft.set_gravity((0, 0, 1e30)), "simulation.gravity"),
         (lambda: draft.set_material("ball", "gold"), "choose one of jelly"),
         (lambda: draft.name_object("ball", " ", 1), "a name is empty"),
-        (lambda: draft.add("ball", 2), "is there already"),
+        (lambda: draft.check_free("ball"), "is there already"),
+        (lambda: draft.set_material("hat", "jelly", 1), "each object has an id of its own"),
+        (lambda: draft.make_fixed("ball"), "none moves"),
+        (lambda: draft.remove("ball"), "none moves"),
         (lambda: draft.set_ground((0, 0, 0), (0, 0, 0)), "planes.ground.normal"),
     ):
         with pytest.raises(SceneError, match=message):
@@ -207,10 +211,11 @@ def test_nothing_is_written_outside_of_the_opened_folder(folder, tmp_path, name)
 
 def test_roles_keep_what_fits_them(folder):
     draft = Draft(open_path(folder / "scene.toml").values, folder, folder)
+    draft.values["input"]["labels"] = "labels.npz"
+    draft.set_material("other", "jelly", 2)
+    assert draft.objects["other"] == {"id": 2, "material": "jelly"}
     draft.make_fixed("ball")
     assert draft.objects["ball"] == {"id": 1, "fixed": True}
-    with pytest.raises(SceneError, match="none moves"):
-        draft.scene()
     draft.set_material("ball", "sand")
     assert draft.objects["ball"] == {"id": 1, "material": "sand"}
     place = {"offset": [0.0, 0.0, 0.2], "copies": [[1.0, 0.0, 0.0]], "keep": "largest"}
@@ -220,7 +225,122 @@ def test_roles_keep_what_fits_them(folder):
     draft.make_fixed("ball")
     assert draft.objects["ball"] == {"id": 1, "fixed": True, **place}
     draft.remove("ball")
-    assert draft.objects == {}
+    assert list(draft.objects) == ["other"]
+
+
+@pytest.fixture
+def poured(tmp_path):
+    """A cup with water, a duck with a copy, and wind on both."""
+    values = {
+        "input": {"gaussians": "cloud.ply", "labels": "labels.npz"},
+        "simulation": {"dx": 0.05},
+        "objects": {
+            "cup": {"id": 1, "fixed": True, "hollow": True},
+            "duck": {"id": 2, "material": "jelly", "copies": [[1.0, 0.0, 0.0]]},
+        },
+        "volumes": {"water": {"fills": "cup", "material": "water", "colour": [0.2, 0.4, 0.9]}},
+        "forces": {"breeze": {"kind": "wind", "velocity": [1.0, 0.0, 0.0], "objects": ["duck", "water"]}},
+    }
+    return Draft(values, tmp_path, tmp_path)
+
+
+def test_references_follow_a_new_name(poured):
+    poured.name_object("cup", "mug", 1)
+    poured.name_object("duck", "bird", 2)
+    poured.name_object("water", "tea", 3)
+    scene = poured.scene()
+    assert (list(scene.objects), list(scene.volumes)) == (["mug", "bird"], ["tea"])
+    assert (scene.volumes["tea"].fills, scene.forces["breeze"].objects) == ("mug", ("bird", "tea"))
+    assert "id" not in poured.table("tea")
+
+
+def test_volumes_and_copies_are_edited_where_their_fields_are(poured):
+    assert poured.table("duck-1") is poured.table("duck")
+    poured.set_number("duck-1", "young", 3e4)
+    poured.set_number("water", "density", 900.0)
+    poured.set_material("water", "jelly")
+    poured.set_velocity("duck-1", (1, 0, 0))
+    scene = poured.scene()
+    assert (list(scene.objects), list(scene.volumes)) == (["cup", "duck"], ["water"])
+    assert (scene.objects["duck"].young, scene.objects["duck"].velocity) == (3e4, (1, 0, 0))
+    assert scene.volumes["water"].density is None  # numbers go with the former matter
+    poured.values["forces"] = {}
+    poured.remove("water")
+    assert poured.scene().volumes == {}
+    poured.set_material("cup", "jelly")  # nothing fills it any more
+    assert "hollow" not in poured.table("cup")
+
+
+def test_what_others_refer_to_stays_and_taken_names_are_refused(poured):
+    before = poured.scene()
+    for wrong, message in (
+        (lambda: poured.remove("cup"), "volumes.water.fills"),
+        (lambda: poured.set_material("cup", "jelly"), "volumes.water.fills"),
+        (lambda: poured.make_fixed("duck"), "forces.breeze.objects"),
+        (lambda: poured.make_fixed("water"), "volumes.water: only captured"),
+        (lambda: poured.remove("water"), "forces.breeze.objects"),
+        (lambda: poured.name_object("duck", "water", 2), "volumes.water: is there already"),
+        (lambda: poured.name_object("cup", "duck-1", 1), "is there already"),
+        (lambda: poured.name_object("duck-1", "drake", 5), "is a copy of objects.duck"),
+        (lambda: poured.remove("duck-1"), "is a copy of objects.duck"),
+        (lambda: poured.set_number("hat", "young", 1e4), "hat: is not in the scene"),
+    ):
+        with pytest.raises(SceneError, match=message):
+            wrong()
+        assert poured.scene() == before
+
+
+@pytest.fixture
+def serve():
+    """Pages without a browser, whose controls are set and called as the page's thread does it."""
+    pytest.importorskip("viser")
+    pages = []
+
+    def begin(path):
+        pages.append(Page(Session(open_path(path)), start_server(port=0)))
+        return pages[-1]
+
+    yield begin
+    for page in pages:
+        page.close()
+
+
+def test_controls_show_the_former_value_where_a_change_is_refused(folder, serve):
+    page = serve(folder / "scene.toml")
+    before = page.session.draft.scene()
+    for control, value, act in (
+        (page.role, "fixed", page._set_role),  # nothing else moves
+        (page.role, "not in the scene", page._set_role),
+        (page.value, -1.0, page._set_number),
+        (page.velocity, (1e9, 0.0, 0.0), page._set_velocity),
+        (page.gravity, (0.0, 0.0, 1e30), page._set_gravity),
+        (page.name, " ", page._rename),
+    ):
+        was = control.value
+        control.value = value
+        with pytest.raises(InputError):
+            act()
+        assert control.value == was
+    page.session.opened.names[9] = "hat"
+    page.name.value = "hat"
+    with pytest.raises(InputError, match="hat: is the name of another object"):
+        page._rename()
+    assert page.session.draft.scene() == before
+    page.name.value = "melon"
+    page._rename()
+    page.role.value = "sand"
+    page._set_role()
+    assert page.session.draft.scene().objects["melon"].material == "sand"
+    assert (page.object.value, page.role.value) == ("1: melon", "sand")
+    page.ground.value = True
+    page._set_ground()
+    assert page.session.ground == pytest.approx(page.session.bottom, abs=1e-3)
+
+
+def test_the_ground_begins_under_the_scene_whatever_is_up(folder):
+    opened = open_path(folder / "cloud.ply", up=(0.6, -0.8, 0.0))
+    means = np.asarray(opened.gaussians.means)
+    assert Session(opened).bottom == pytest.approx((means @ [0.6, -0.8, 0.0]).min(), abs=1e-6)
 
 
 # what is drawn
@@ -309,6 +429,53 @@ def test_a_run_with_states_of_other_particles_is_refused(finished, tmp_path):
     session.refresh_frames()
     with pytest.raises(InputError, match="a state has 5 particles"):
         session.show_frame(1)
+
+
+def test_frames_that_come_later_are_found(tmp_path):
+    """A run that goes on: the page looks for new states while it does not play."""
+    still = {name: np.zeros((2, *shape)) for name, shape in (("x", (3,)), ("v", (3,)), ("F_visual", (3, 3)))}
+
+    def simulate(*frames):
+        for frame in frames:
+            io.save_state(tmp_path / "states", frame, still, signature="s")
+
+    simulate(0, 1)
+    session = SimpleNamespace(opened=SimpleNamespace(run=SimpleNamespace(folder=tmp_path)), live=None)
+    session.refresh_frames = MethodType(Session.refresh_frames, session)
+    page = SimpleNamespace(session=session, time=SimpleNamespace(max=1), _polled=-1e9)
+    Page._poll(page)
+    assert (session.frames, page.time.max) == ([0, 1], 1)
+    simulate(2, 3)
+    Page._poll(page)
+    assert session.frames == [0, 1], "it looks once a second"
+    page._polled = -1e9
+    Page._poll(page)
+    assert (session.frames, page.time.max) == ([0, 1, 2, 3], 3)
+
+
+def test_a_run_without_states_opens_as_its_scene(tmp_path):
+    write_throw(tmp_path)
+    (tmp_path / "states").mkdir()
+    opened = open_path(tmp_path)
+    assert (opened.run, opened.names) == (None, {1: "ball"})
+    assert "no states" in opened.notes[0]
+
+
+@pytest.mark.slow
+def test_the_frames_of_a_run_are_there_again_after_a_live_simulation(finished, serve):
+    page = serve(finished)
+    session = page.session
+    page._go_to(2)
+    before = session.shown(1)
+    page._switch()
+    assert session.live is not None
+    assert (page.time.visible, page.simulate.label) == (False, "frames of the run")
+    page._switch()
+    assert (session.live, session.frame) == (None, 2)
+    assert (page.time.visible, page.simulate.label) == (True, "simulate live")
+    after = session.shown(1)
+    for was, now in zip(before, after):
+        np.testing.assert_array_equal(was, now)
 
 
 def test_a_live_simulation_falls_is_dragged_changes_matter_and_goes_back(folder):

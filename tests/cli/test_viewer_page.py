@@ -164,7 +164,10 @@ def test_matter_is_simulated_and_follows_the_mouse(browser, serve, folder):
     client.mouse.move(x - 20, y - 20, steps=4)
     client.mouse.move(x - 60, y - 60, steps=6)
     until(client, lambda: page.session.live.holds)
-    until(client, lambda: np.linalg.norm(np.asarray(page.session.live.particles.x).mean(0) - start) > 0.03)
+    begun = page.session.frame
+    until(client, lambda: page.session.frame > begun + 45 or not page.playing, 300)  # 1.5 s, three periods of the hand
+    moved = np.linalg.norm(np.asarray(page.session.live.particles.x).mean(0) - start)
+    assert moved > 0.03, f"frame {page.session.frame}, {page.said.content}, {page.pace.content}"
     client.mouse.up()
     until(client, lambda: not page.session.live.holds)
     assert np.asarray(page.session.live.particles.x).mean(0)[2] > start[2] + 0.01  # dragged up

@@ -49,7 +49,9 @@ def frames():
 
 # ---- glTF
 
-# the schema of KHR_gaussian_splatting's object, from the tables of its specification
+# what a file without further extensions may hold: the properties that mesh.primitive.KHR_gaussian_splatting.schema.json
+# lists and requires, with the values that the tables of the specification give (the schema itself leaves any string to
+# extensions of the extension)
 SCHEMA = {
     "type": "object",
     "required": ["kernel", "colorSpace"],
@@ -61,6 +63,8 @@ SCHEMA = {
     },
     "additionalProperties": False,
 }
+# type of each attribute's accessor, of the specification's table for the ellipse kernel; floats are allowed for all
+TYPES = {"POSITION": "VEC3", "ROTATION": "VEC4", "SCALE": "VEC3", "OPACITY": "SCALAR", "SH": "VEC3"}
 ATTRIBUTES = {
     "type": "object",
     "required": ["POSITION", *(f"{EXTENSION}:{n}" for n in ("ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"))],
@@ -89,7 +93,8 @@ def test_glb_follows_the_schema_and_another_reader_finds_the_numbers(tmp_path, f
     def values(name):
         accessor = gltf.accessors[names[name]]
         view = gltf.bufferViews[accessor.bufferView]
-        assert (accessor.componentType, accessor.count) == (pygltflib.FLOAT, COUNT)
+        kind = TYPES[name.removeprefix(f"{EXTENSION}:").partition("_")[0]]
+        assert (accessor.componentType, accessor.type, accessor.count) == (pygltflib.FLOAT, kind, COUNT)
         assert view.byteOffset % 4 == 0
         return np.frombuffer(blob, "<f4", offset=view.byteOffset, count=view.byteLength // 4).reshape(COUNT, -1)
 

@@ -5,6 +5,7 @@ import warnings
 from pathlib import Path
 
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import pytest
 from PIL import Image
@@ -12,8 +13,12 @@ from typer.testing import CliRunner
 
 from pigjax import io
 from pigjax.cli import app
+from pigjax.cli.drafting import write_draft
+from pigjax.cli.segmenting import describe_file
+from pigjax.cli.viewer.opened import open_path
 from pigjax.core.errors import InputError, MissingFileError
 from pigjax.io.finding import find_parts
+from pigjax.io.formats import SPLAT_SUFFIXES
 from pigjax.scene import load_scene, run_scene
 from pigjax.scene.draft import (
     Part,
@@ -134,6 +139,68 @@ def test_a_single_thing_is_one_object(tmp_path):
     assert (list(scene.objects), scene.input.labels, scene.world.up) == (["part_1"], None, "y")
     assert scene.world.origin[1] == pytest.approx(-0.3, abs=0.02)
     assert scene.planes["ground"].point[2] == 0
+
+
+def test_one_thing_with_photos_and_no_masks_is_a_scene_that_runs(tmp_path, monkeypatch):
+    """Its file has labels, since a scene with photos and without labels wants masks."""
+    monkeypatch.setattr("pigjax.cli.drafting.thumbnails", lambda _: {})
+    for name in ("transforms.json", "images"):
+        (tmp_path / name).symlink_to(TABLETOP / name)
+    io.save_ply(tmp_path / "ball.ply", splats(sphere(np.array([0, 0, 0.4]), 0.1, 600, np.random.default_rng(2))))
+    draft = write_draft(find_parts(tmp_path), tmp_path / "scene", up="z")
+    assert draft.labels is not None
+    scene = load_scene(tmp_path / "scene" / "scene.toml")
+    assert (scene.input.labels, scene.objects["part_1"].id) == ("labels.npz", 1)
+    inputs = read_inputs(msgspec.structs.replace(scene, input=msgspec.structs.replace(scene.input, max_size=16)))
+    assert inputs.views.masks is None
+    assert (np.asarray(segment(scene, inputs).object_id) == 1).all()
+
+
+def test_a_true_height_gives_the_scale_of_scene_and_comments(tmp_path, monkeypatch):
+    """By the option or by an answer: the ball of 0.6 units is 30 cm tall in the plan, and lengths are halved."""
+    io.save_ply(tmp_path / "ball.ply", splats(sphere(np.array([1.0, 2, 5]), 0.3, 900, np.random.default_rng(2))))
+    monkeypatch.setattr("pigjax.cli.drafting.thumbnails", lambda _: {})
+    asked = []
+    plain = write_draft(find_parts(tmp_path / "ball.ply"), tmp_path / "asked", up="z", ask_height=lambda name, units: (
+        asked.append((name, units)), "")[1])  # fmt: skip
+    assert asked == [("part_1", pytest.approx(0.6, rel=0.03))]
+    told = new(tmp_path / "ball.ply", "-o", tmp_path / "scene", "--up", "z", "--height", "30 cm")
+    assert told.exit_code == 0, told.output
+    text = (tmp_path / "scene" / "scene.toml").read_text()
+    answer = write_draft(
+        find_parts(tmp_path / "ball.ply"), tmp_path / "scene", up="z", ask_height=lambda *_: "30 cm"
+    ).text
+    assert answer == text
+
+    def radius(text):
+        return float(re.search(r"^# radius = (\S+) # m", text, re.M)[1])
+
+    assert radius(text) / radius(plain.text) == pytest.approx(0.5, rel=0.03)  # three digits, and ends of the ball
+    scene = load_scene(tmp_path / "scene" / "scene.toml")
+    assert scene.objects["part_1"].height == "30 cm"
+    x = np.asarray(read_inputs(scene).gaussians.means)
+    assert np.ptp(x[:, 2]) == pytest.approx(0.3, rel=0.03)
+    assert x[:, 2].min() == pytest.approx(0, abs=0.005)
+    assert "write a length with its unit" in str(
+        new(tmp_path / "ball.ply", "--height", "3", "-o", tmp_path / "b").exception
+    )
+
+
+@pytest.mark.parametrize("suffix", SPLAT_SUFFIXES)
+def test_every_file_of_splats_is_described_viewed_found_and_drafted(suffix, tmp_path, monkeypatch):
+    """The commands take the suffixes of `load_gaussians`, whose readers have tests of their own."""
+    cloud = splats(sphere(np.zeros(3), 0.3, 60, np.random.default_rng(2)))
+    path = tmp_path / f"thing{suffix}"
+    path.write_bytes(b"")
+    for name in ("io.finding.load_gaussians", "io.load_gaussians"):
+        monkeypatch.setattr(f"pigjax.{name}", lambda *_, **__: cloud)
+    monkeypatch.setattr("pigjax.io.read_gaussians", lambda *_, **__: (cloud, 0))
+    monkeypatch.setattr("pigjax.io.origin_of", lambda _: (0.0, 0.0, 0.0))
+    assert describe_file(path)["Gaussians"] == "60"
+    assert len(open_path(path).gaussians) == 60
+    assert find_parts(path).gaussians == path
+    assert find_parts(tmp_path).gaussians == path
+    assert draft_scene(path, tmp_path, up="z").parts[0].name == "part_1"
 
 
 def test_a_plant_is_held_at_its_soil(tmp_path):

@@ -116,6 +116,26 @@ def test_what_is_left_out_follows_the_scene():
     assert "contact_friction" in " ".join(left_out(scene_from(values(input=seen, objects=pair)), report))
 
 
+def test_copies_and_volumes_are_objects_of_the_page_and_removed_ones_do_not_move():
+    duck = {"id": 1, "material": "jelly", "copies": [[1.0, 0, 0], [2.0, 0, 0]]}
+    cup = {"id": 2, "fixed": True, "hollow": True}
+    water = {"fills": "cup", "material": "water", "colour": [0, 0, 1.0]}
+    seen = {"gaussians": "cloud.ply", "labels": "labels.npz"}
+    gone = {"id": 3, "removed": True}
+    scene = scene_from(values(input=seen, objects={"duck": duck, "cup": cup}, volumes={"water": water}))
+    report = RunReport(sizes={"gaussians_of": {"duck": 11, "duck-1": 12, "duck-2": 13, "cup": 14, "water": 15}})
+    texts = Balanced(report_page(scene, report, settings="")).texts
+    rows = [texts[texts.index(name) + 1 :][:2] for name in ("duck", "duck-1", "duck-2", "cup", "water")]
+    assert rows == [["jelly", "11"], ["jelly", "12"], ["jelly", "13"], ["fixed", "14"], ["water", "15"]]
+    assert any("Contact" in text for text in left_out(scene, report)), "three ducks and water share a field"
+    one = {"duck": {"id": 1, "material": "jelly"}, "cup": gone}
+    alone = scene_from(values(input=seen, objects=one))
+    assert "removed" in Balanced(report_page(alone, report, settings="")).texts
+    assert not any("Contact" in text for text in left_out(alone, report))
+    poured = scene_from(values(input=seen, objects={**one, "cup": cup}, volumes={"water": water}))
+    assert any("Contact" in text for text in left_out(poured, report))
+
+
 @pytest.mark.parametrize("series", [[1.0], [2.0, 2.0], [np.nan, 1.0, np.inf], [np.nan]])
 def test_charts_of_odd_curves_are_finite(series):
     text = chart("a", "b", {"c": np.asarray(series)}, 0.1)

@@ -15,6 +15,7 @@ from jaxtyping import Int
 from pigjax import io
 from pigjax.core.errors import InputError
 from pigjax.core.upright import find_up
+from pigjax.io.formats import SPLAT_SUFFIXES
 from pigjax.scene import Scene, scene_from
 from pigjax.scene.arrangement import arrange
 from pigjax.scene.plan import Inputs, read_inputs, segment
@@ -25,7 +26,6 @@ from pigjax.splat import Gaussians
 from pigjax.splatting.types import extent_of
 
 Up = str | tuple[float, float, float]
-SPLATS = (".ply", ".splat", ".spz")
 _CELLS = 24  # of the scene's radius, where nothing says how fine its simulation is to be
 _FRAMES = 96
 
@@ -46,6 +46,23 @@ class Opened:
     read: Inputs | None = None  # files of the scene; None: of a run, which reads them when they are needed
     labels: Labels | None = None  # as lifted
     notes: list[str] = field(default_factory=list)
+    joined: bool = False  # whether its splats lie in several files, and are in one only where `write_joined` put it
+
+    def write_joined(self) -> None:
+        """Write the splats and their objects as the files that the values of the scene name.
+
+        Raises:
+            InputError: they cannot be written.
+        """
+        assert self.read is not None
+        assert self.labels is not None
+        spec = self.values["input"]
+        io.save_ply(self.folder / spec["gaussians"], self.read.gaussians, origin=spec.get("origin"))
+        mark = None if "origin" in spec else io.digest_of_scene(self.read.gaussians)
+        labels = self.labels
+        io.save_labels(
+            self.folder / spec["labels"], labels.object_id, labels.votes, labels.confidence, labels.ids, scene=mark
+        )
 
     def prepared(self, scene: Scene) -> tuple[Scene, Inputs, Labels]:
         """What `make_plan` needs, for the objects of a scene.
@@ -59,7 +76,8 @@ class Opened:
         assert self.labels is not None
         named = {name: number for number, name in self.names.items()} | self.read.ids
         ids = {name: named.get(name, -1) if spec.id is None else spec.id for name, spec in scene.objects.items()}
-        return arrange(scene, replace(self.read, ids=ids), self.labels)
+        own = {self.names.get(self.read.ids[name], name): cloud for name, cloud in self.read.own.items()}
+        return arrange(scene, replace(self.read, ids=ids, own=own), self.labels)
 
 
 def open_path(
@@ -74,7 +92,7 @@ def open_path(
     """Read what is to be shown. Host.
 
     Args:
-        path: a `.ply`, `.splat` or `.spz`, a scene file, or the folder of a run, of `pigjax segment` or of a scene.
+        path: a file of splats, a scene file, or the folder of a run, of `pigjax segment` or of a scene.
         accuracy: level of the scene instead of its file's.
         drop_invalid: leave out Gaussians with NaN or infinity.
         origin: subtracted from the positions of a file of splats [m]; None: as the file says.
@@ -85,17 +103,21 @@ def open_path(
         MissingFileError: there is nothing at `path`.
         InputError: nothing there can be shown, or a file is damaged.
     """
-    if path.suffix.lower() in SPLATS:
+    if path.suffix.lower() in SPLAT_SUFFIXES:
         return _open_splats(path, drop_invalid, origin, up or "z")
     if path.suffix == ".toml":
         return _open_scene(read_file(path, "scene file"), path.parent, path.name, accuracy, tell)
     if (path / "states").is_dir() and (path / "scene.toml").is_file():
-        return _open_run(path)
+        if io.state_frames(path / "states"):
+            return _open_run(path)
+        opened = _open_scene(read_file(path / "scene.toml", "scene file"), path, path.name, accuracy, tell)
+        opened.notes.append("this run keeps no states, or has none yet: play simulates its scene from the start")
+        return opened
     if (path / "labels.npz").is_file() and (path / "objects").is_dir():
         return _open_segments(path, drop_invalid, up or "z")
     if (path / "scene.toml").is_file():
         return _open_scene(read_file(path / "scene.toml", "scene file"), path, "scene.toml", accuracy, tell)
-    known = f"a {', '.join(SPLATS)}, a scene file (.toml), or the folder of a run, of 'pigjax segment' or of a scene"
+    known = f"a {', '.join(SPLAT_SUFFIXES)}, a scene file (.toml), or the folder of a run, of 'segment' or of a scene"
     io.output_folder(path) if path.is_dir() else io.read_gaussians(path)  # says what is wrong with the path itself
     raise InputError(f"{path}: nothing to show in it; give {known}.")
 
@@ -159,21 +181,27 @@ def _of_splats(
 def _open_segments(path: Path, drop_invalid: bool, up: Up) -> Opened:
     """The objects of `pigjax segment`, joined again."""
     clouds, ids, names = [], [], {}
+    origin: tuple[float, float, float] | None = None
     for file in sorted((path / "objects").glob("*.ply")):
         number, _, name = file.stem.partition("_")
         if not (number.isdecimal() or number == "unseen"):
             continue
-        clouds.append(io.load_gaussians(file, drop_invalid=drop_invalid, origin=io.origin_of(file)))
+        origin = origin or io.origin_of(file)  # of the first, for all: they are parts of one scene
+        clouds.append(io.load_gaussians(file, drop_invalid=drop_invalid, origin=origin))
         ids.append(np.full(len(clouds[-1]), -1 if number == "unseen" else int(number), np.int32))
-        if name:
-            names[int(number)] = name
+        if ids[-1][0] > 0:
+            names[int(number)] = name or f"object-{int(number)}"
     if not clouds:
         raise InputError(f"{path / 'objects'}: no object in it; run 'pigjax segment' again.")
     widest = max(cloud.sh.shape[1] for cloud in clouds)
     gaussians = jax.tree.map(lambda *parts: jnp.concatenate(parts), *(_widened(cloud, widest) for cloud in clouds))
-    values = new_values(gaussians, "gaussians.ply", names, up)
-    note = "a scene file needs the photos and masks that these objects came from: add input.views"
-    return _of_splats(path.name, path, gaussians, np.concatenate(ids), names, values, [note])
+    values = new_values(gaussians, "joined.ply", names, up)
+    values["input"]["labels"] = "joined-labels.npz"
+    if origin and any(origin):
+        values["input"]["origin"] = list(origin)
+    opened = _of_splats(path.name, path, gaussians, np.concatenate(ids), names, values, [])
+    opened.joined = True
+    return opened
 
 
 def _widened(gaussians: Gaussians, bands: int) -> Gaussians:

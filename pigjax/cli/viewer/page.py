@@ -18,6 +18,7 @@ from pigjax.mpm.materials import PRESETS
 from pigjax.mpm.materials.table import LIMITS
 
 _POLL = 1.0  # seconds between looks for new frames of a run
+_LIVE, _FRAMES = "simulate live", "frames of the run"
 _OUT, _FIXED, _LAW = "not in the scene", "fixed", "its own law"
 _NUMBERS = tuple(name for name in LIMITS if name != "bulk")
 
@@ -202,8 +203,8 @@ class Page:
         self.time = gui.add_slider("frame", 0, max(last, 1), 1, 0, visible=is_run)
         self._on(self.time, "time", lambda: self._seek(self.time.value))
         self.rate = gui.add_slider("frames/s", 1, 60, 1, 24, visible=is_run)
-        self.simulate = gui.add_button("simulate live", visible=is_run)
-        self._on(self.simulate, "simulate", self._begin_live, click=True)
+        self.simulate = gui.add_button(_LIVE, visible=is_run)
+        self._on(self.simulate, "simulate", self._switch, click=True)
         self.restart = self._on(gui.add_button("restart"), "restart", self._restart, click=True)
         self.strength = gui.add_slider(
             "drag", 0.1, 10.0, 0.1, 1.0, hint="strength of the spring between mouse and matter"
@@ -247,19 +248,13 @@ class Page:
 
     def _build_world(self, gui: Any) -> None:
         session = self.session
-        strength = session.draft.values.get("simulation", {}).get("gravity", 9.81)
-        vector = np.asarray(strength, float) if np.ndim(strength) else -float(strength) * session.up
+        vector = session.gravity
         self.gravity = gui.add_vector3("gravity", tuple(vector.tolist()), step=0.5, hint="[m/s²]")
         self._on(self.gravity, "gravity", self._set_gravity)
         self.stage.gravity = vector
         self.arrow = self._on(gui.add_checkbox("gravity arrow", False), "extras", self._change_extras)
-        plane = session.draft.values.get("planes", {}).get("ground")
-        bottom = (
-            float(np.dot(session.extent.low, session.up))
-            if session.up.sum() > 0
-            else float(np.dot(session.extent.high, session.up))
-        )
-        height = bottom if plane is None else float(np.dot(plane["point"], session.up))
+        plane = session.ground
+        height = session.bottom if plane is None else plane
         self.ground = gui.add_checkbox("ground", plane is not None, hint="a plane that matter cannot pass")
         self.height = gui.add_number("height", round(height, 4), step=0.01)
         self._on(self.ground, "ground", self._set_ground)
@@ -286,13 +281,33 @@ class Page:
         self.playing = False
         self.play.label = "play"
 
+    def _switch(self) -> None:
+        """From the frames of a run to a live simulation of its scene, or back."""
+        self._stop_playing()
+        if self.session.live is None:
+            self._begin_live()
+        else:
+            self.session.stop_live()
+            self._take_objects()
+            self._seek(int(self.time.value))
+
     def _begin_live(self) -> None:
         self._say("preparing matter for the simulation ...")
         self.session.start_live()
         self.stale = False
         self._say("ready; drag matter with the left button while it plays")
-        self.time.visible = self.rate.visible = False
+        self._take_objects()
+
+    def _take_objects(self) -> None:
+        """Show the objects that there are now, and the controls of frames or of a live simulation."""
+        session = self.session
+        is_run = session.opened.run is not None
+        self.time.visible = self.rate.visible = is_run and session.live is None
+        self.simulate.label = _LIVE if session.live is None else _FRAMES
+        self.object.options = self._names()
+        self._select(self._selected if self._selected in session.ids else session.ids[0])
         self.stage.push_all()
+        self._tell_time()
 
     def _restart(self) -> None:
         self._stop_playing()
@@ -338,16 +353,16 @@ class Page:
         session, self._selected = self.session, number
         self.object.value = f"{number}: {session.name_of(number)}"
         name, table = session.name_of(number), self._table()
-        self.about.content = f"id {number}, {len(session.groups[number]):,} splats"
+        of = f"; a copy of {session.draft.owner(name)}, whose fields these are" if session.draft.is_copy(name) else ""
+        self.about.content = f"id {number}, {len(session.groups[number]):,} splats{_plain(of)}"
         self.visible.value = number not in session.hidden
         self.name.value = name
-        own = _LAW if table is not None and "model" in table else None
-        self.role.value = _OUT if table is None else _FIXED if table.get("fixed") else own or str(table["material"])
+        self.role.value = _OUT if table is None else _FIXED if table.get("fixed") else table.get("material", _LAW)
         self.velocity.value = tuple((table or {}).get("velocity", (0.0, 0.0, 0.0)))
         self._show_number()
 
     def _table(self) -> dict[str, Any] | None:
-        return self.session.draft.objects.get(self.session.name_of(self._selected))
+        return self.session.draft.table(self.session.name_of(self._selected))
 
     def _show_number(self) -> None:
         table = self._table() or {}
@@ -364,36 +379,45 @@ class Page:
         self.visible.value = True
 
     def _rename(self) -> None:
-        old, new = self.session.name_of(self._selected), self.name.value.strip()
-        if old in self.session.draft.objects:
-            self.session.draft.name_object(old, new, self._selected)
-        if new:
+        draft, old, new = self.session.draft, self.session.name_of(self._selected), self.name.value.strip()
+        try:
+            if new == old:
+                return
+            self._refuse_no_object()
+            if new in self.session.opened.names.values():
+                raise InputError(f"{new}: is the name of another object; choose another one.")
+            if draft.table(old) is None:
+                draft.check_free(new)
+            else:
+                draft.name_object(old, new, self._selected)
             self.session.opened.names[self._selected] = new
             self.object.options = self._names()
-            self._select(self._selected)
             self.stale = True
+        finally:
+            self._select(self._selected)
+
+    def _refuse_no_object(self) -> None:
+        if self._selected <= 0:
+            name = self.session.name_of(self._selected)
+            raise InputError(f"{name}: is no object; segment the scene to give it an id.")
 
     def _set_role(self) -> None:
         draft, name, role = self.session.draft, self.session.name_of(self._selected), self.role.value
-        if self._selected <= 0 and role != _OUT:
-            self._select(self._selected)
-            raise InputError(f"{name}: is no object; segment the scene to give it an id.")
-        if role == _OUT:
-            draft.remove(name)
-        elif role != _LAW:
-            if name not in draft.objects:
-                draft.add(name, self._selected)
-            if role == _FIXED:
-                draft.make_fixed(name)
+        try:
+            if role == _OUT:
+                draft.remove(name)
             else:
-                draft.set_material(name, role)
-        self._show_number()
+                self._refuse_no_object()
+            if role == _FIXED:
+                draft.make_fixed(name, self._selected)
+            elif role in PRESETS:
+                draft.set_material(name, role, self._selected)
+        finally:
+            self._select(self._selected)
         self._change_matter(name)
 
     def _set_number(self) -> None:
         name = self.session.name_of(self._selected)
-        if self._table() is None:
-            raise InputError(f"{name}: is not in the scene; give it a material first.")
         try:
             self.session.draft.set_number(name, self.number.value, self.value.value)
         finally:
@@ -402,37 +426,42 @@ class Page:
 
     def _change_matter(self, name: str) -> None:
         """Let a live simulation go on with an object's new matter, where it can."""
-        live, table = self.session.live, self._table()
-        if live is None:
+        if self.session.live is None:
             return
-        if table is not None and not table.get("fixed") and live.moves(name):
-            spec = self.session.draft.scene().objects[name]
-            live.set_material(name, spec.to_material(name))
-            self._say(f"{name} is of other matter now")
+        if self.session.change_matter(name):
+            self._say(f"{self.session.draft.owner(name)} is of other matter now")
         else:
             self.stale = True
             self._say("restart to simulate the scene with this change")
 
     def _set_velocity(self) -> None:
-        name = self.session.name_of(self._selected)
-        if self._table() is None:
-            raise InputError(f"{name}: is not in the scene; give it a material first.")
-        self.session.draft.set_velocity(name, self.velocity.value)
-        self.stale = True
+        try:
+            self.session.draft.set_velocity(self.session.name_of(self._selected), self.velocity.value)
+            self.stale = True
+        finally:
+            self._select(self._selected)
 
     def _set_gravity(self) -> None:
-        self.session.draft.set_gravity(self.gravity.value)
+        try:
+            self.session.draft.set_gravity(self.gravity.value)
+        finally:
+            self.stage.gravity = self.session.gravity
+            self.gravity.value = tuple(self.stage.gravity.tolist())
         if self.session.live is not None:
             self.session.live.set_gravity(self.gravity.value)
-        self.stage.gravity = np.asarray(self.gravity.value, float)
         self.stage.push_extras()
 
     def _set_ground(self) -> None:
         up = self.session.up
         point = (self.height.value * up).tolist() if self.ground.value else None
-        self.session.draft.set_ground(point, up.tolist())
-        self.stale = True
-        self._show_ground()
+        try:
+            self.session.draft.set_ground(point, up.tolist())
+            self.stale = True
+        finally:
+            height = self.session.ground
+            self.ground.value = height is not None
+            self.height.value = self.height.value if height is None else height
+            self._show_ground()
 
     def _show_ground(self) -> None:
         self.stage.ground = float(self.height.value) if self.ground.value else None

@@ -1,4 +1,4 @@
-"""Picking: what a ray from the eye meets, of splats and of particles. Host, float64."""
+"""Picking: the splat that a ray from the eye meets. Host, float64."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _FAR = 3.0  # standard deviations beyond which a splat is not met
 class Hit(NamedTuple):
     """The nearest hit of a ray."""
 
-    row: int  # of the splat or particle
+    row: int  # of the splat
     point: Float[np.ndarray, "3"]  # [m]
     depth: float  # along the ray [m]
 
@@ -69,21 +69,3 @@ def _densest(
     depth = np.sum(weighted * offset, 1) / np.dot(weighted, direction)
     rest = offset - depth[:, None] * direction
     return depth, np.einsum("mi,mij,mj->m", rest, precision, rest)
-
-
-def pick_particle(
-    x: Float[np.ndarray, "p 3"],
-    radius: float,
-    origin: Float[np.ndarray, "3"],
-    direction: Float[np.ndarray, "3"],
-) -> Hit | None:
-    """The particle that a ray meets first; particles are balls of a radius [m]. None where it meets none."""
-    direction = np.asarray(direction, np.float64) / np.linalg.norm(direction)
-    offset = np.asarray(x, np.float64) - origin
-    along = np.dot(offset, direction)
-    apart = np.linalg.norm(offset - along[:, None] * direction, axis=1)
-    met = np.flatnonzero((apart <= radius) & (along > 0))
-    if not len(met):
-        return None
-    first = met[np.argmin(along[met] - np.sqrt(radius**2 - apart[met] ** 2))]
-    return Hit(int(first), np.asarray(origin + along[first] * direction), float(along[first]))

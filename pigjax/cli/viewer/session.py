@@ -21,7 +21,7 @@ from pigjax.cli.viewer.colouring import (
     strain_of,
     value_colours,
 )
-from pigjax.cli.viewer.draft import Draft
+from pigjax.cli.viewer.draft import GROUND, Draft
 from pigjax.cli.viewer.live import Live
 from pigjax.cli.viewer.opened import Opened
 from pigjax.cli.viewer.picking import Hit, pick_splat
@@ -96,11 +96,16 @@ class Session:
 
     def __post_init__(self) -> None:
         opened = self.opened
-        self.draft = Draft(opened.values, opened.base, opened.folder, accuracy=opened.accuracy)
+        self.draft = Draft(
+            opened.values, opened.base, opened.folder, accuracy=opened.accuracy,
+            write_inputs=opened.write_joined if opened.joined else None,
+        )  # fmt: skip
         clamp = {k: v for k, v in opened.values.get("clamp", {}).items() if k in ClampSpec.__struct_fields__}
         self.look = replace(self.look, **clamp)
         self.up = axis_of(opened.values.get("input", {}).get("up", "z"))
         self.extent = extent_of(opened.gaussians)
+        core = np.asarray(opened.gaussians.means, np.float64)[self.extent.core]
+        self.bottom = float(np.dot(core, self.up).min())  # height of the lowest splat of the dense core [m]
         self._take_splats(opened.gaussians, opened.object_id)
         self._object_of_particle = np.zeros(0, int)
         self.poser: Poser | None = None
@@ -137,6 +142,18 @@ class Session:
     def typical_size(self) -> float:
         """Median over the splats of the root of their covariance's trace [m]."""
         return float(np.median(np.sqrt(np.trace(self._rest_covariances[self.kept], axis1=1, axis2=2))))
+
+    @property
+    def gravity(self) -> Float[np.ndarray, "3"]:
+        """Of the scene as it is written now [m/s²]."""
+        given = self.draft.values.get("simulation", {}).get("gravity", 9.81)
+        return np.asarray(given, float) if np.ndim(given) else -float(given) * self.up
+
+    @property
+    def ground(self) -> float | None:
+        """Height of the plane that the page draws [m]; None where there is none."""
+        plane = self.draft.values.get("planes", {}).get(GROUND)
+        return None if plane is None else float(np.dot(plane["point"], self.up))
 
     @property
     def seconds(self) -> float:
@@ -260,10 +277,32 @@ class Session:
             self._follow_live()
 
     def stop_live(self) -> None:
-        """Show the scene at rest again."""
+        """Show the scene at rest again, or the run that it was opened from."""
         self.live, self._moment, self.poser, self.colliders = None, None, None, ()
+        self.frame = 0
+        if (run := self.opened.run) is not None:
+            self._take_splats(run.gaussians, run.object_id)
+            self._take_run(run)
         self._to_rest()
         self.redraw()
+
+    def change_matter(self, name: str) -> bool:
+        """Let a live simulation go on with new matter of an object, of its copies, or of a volume; whether it can.
+
+        Raises:
+            SceneError: the scene is impossible.
+        """
+        live, table = self.live, self.draft.table(name)
+        if live is None or table is None or table.get("fixed"):
+            return False
+        owner, scene = self.draft.owner(name), self.draft.scene()
+        mine = [other for other in live.objects if self.draft.owner(other) == owner]
+        if not mine or not all(live.moves(other) for other in mine):
+            return False
+        material = {**scene.objects, **scene.volumes}[owner].to_material(owner)
+        for other in mine:
+            live.set_material(other, material)
+        return True
 
     # how it is drawn
 
