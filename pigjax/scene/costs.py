@@ -8,9 +8,8 @@ those of each stage are multiplied by the ratio of a small task of the same kind
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,8 +19,10 @@ from pigjax import io
 STAGES = ("read", "segment", "seed", "simulate", "draw")
 PROBE_OF = {"read": "host", "segment": "picture", "seed": "host", "simulate": "step", "draw": "picture"}
 IMPLICIT = 400  # explicit steps in the time of an implicit one, by benchmarks/implicit.py
+ESTIMATE = "estimated error: "  # prefix of the parts of the run that estimates the error
 _STATE_BYTES, _HALF_STATE_BYTES = 60, 36  # x, v and F_visual of a particle; the latter two in half precision
 _ALPHA = 1 / 255  # thresholds of the measured standard
+_FLUID_CFL = 0.6  # above which longer steps of a fluid gain no accuracy
 _COARSER = 1.5  # dx of the run that estimates the error, over that of the run itself
 
 
@@ -208,12 +209,9 @@ def run_parts(needs: Required) -> list[Part]:
     ]
     if needs.error_frames:
         coarse = needs.error_frames * needs.substeps / _COARSER
-        parts += [
-            Part("simulate", f"estimated error: {part.name}", part.amount / _COARSER**3)
-            for part in _steps(needs, coarse)
-        ]
-        parts.append(Part("seed", "estimated error: Gaussians that move", needs.moving))
-        parts.append(Part("seed", "estimated error: objects that move", bodies))
+        parts += [Part("simulate", ESTIMATE + part.name, part.amount / _COARSER**3) for part in _steps(needs, coarse)]
+        parts.append(Part("seed", ESTIMATE + "Gaussians that move", needs.moving))
+        parts.append(Part("seed", ESTIMATE + "objects that move", bodies))
     return [part for part in parts if part.amount]
 
 
@@ -251,9 +249,7 @@ def compile_parts(needs: Required) -> list[Part]:
         Part("draw", "start", 1),
     ]
     if needs.error_frames:
-        parts += [
-            Part("simulate", f"estimated error: {part.name}", part.amount) for part in parts if part.stage == "simulate"
-        ]
+        parts += [Part("simulate", ESTIMATE + part.name, part.amount) for part in parts if part.stage == "simulate"]
     return [part for part in parts if part.amount]
 
 
@@ -313,7 +309,7 @@ def predict(needs: Required, prices: Prices | None = None, *, speed: Mapping[str
 
 
 def _price(known: Mapping[str, float], name: str) -> float:
-    name = name.removeprefix("estimated error: ")
+    name = name.removeprefix(ESTIMATE)
     if name in known or not name.startswith("law "):
         return known.get(name, 0.0)
     return max((value for key, value in known.items() if key.startswith("law ")), default=0.0)
@@ -324,7 +320,8 @@ def matter_error(needs: Required, prices: Prices | None = None) -> float:
 
     It is of first order in dx: the error of a law on eight cells times eight over the cells of each body, root mean
     square over particles. Fronts of docs/results/TRADEOFF.md gave the numbers, those of `cfl` and `particles_per_cell`
-    as powers.
+    as powers: longer steps damp a little less. Fluids, which break down at 0.8 where they are compressed, gain nothing
+    above the standard's 0.6.
 
     Args:
         needs: of the scene.
@@ -332,9 +329,13 @@ def matter_error(needs: Required, prices: Prices | None = None) -> float:
     """
     known = (prices or shipped_prices()).error
     worst = max(known.values(), default=0.0)
-    square = sum(b.particles * (known.get(b.law, worst) * 8 / max(b.cells, 1e-9)) ** 2 for b in needs.bodies)
-    error = math.sqrt(square / max(needs.particles, 1))
-    error *= (needs.cfl / 0.4) ** -0.2 * (needs.particles_per_cell / 8) ** -0.1
+
+    def of(body: Body) -> float:
+        cfl = min(needs.cfl, _FLUID_CFL) if body.law == "fluid" else needs.cfl
+        return known.get(body.law, worst) * 8 / max(body.cells, 1e-9) * (cfl / 0.4) ** -0.2
+
+    square = sum(body.particles * of(body) ** 2 for body in needs.bodies)
+    error = math.sqrt(square / max(needs.particles, 1)) * (needs.particles_per_cell / 8) ** -0.1
     return error * (1.35 if needs.kernel == "cubic" else 1.0)
 
 
@@ -347,45 +348,6 @@ def picture_error(needs: Required) -> float:
     faint = 1.3e-3 * needs.alpha_min / _ALPHA
     smaller = 0.0134 * max(1 / needs.scale - 1, 0)
     return math.hypot(faint, smaller, 0.015 * needs.fewer_bands)
-
-
-@dataclass
-class Comparison:
-    """Predicted time beside the time that was spent."""
-
-    predicted: Prediction
-    spent: dict[str, float]  # [s] by stage, without compilation
-    compiled: dict[str, float]  # [s] by stage
-
-    def line(self) -> str:
-        """In one line."""
-        spent, compiled = math.fsum(self.spent.values()), math.fsum(self.compiled.values())
-        return (
-            f"predicted {duration(self.predicted.run_seconds)} and {duration(self.predicted.compile_seconds)} to"
-            f" compile; took {duration(spent)} and {duration(compiled)}"
-        )
-
-
-@dataclass
-class Pace:
-    """A simulation's time beside its prediction, while it goes on."""
-
-    predicted: Prediction
-    frames: int
-    apart: bool  # whether drawing begins after the simulation
-    begun: float = field(default_factory=time.perf_counter)
-
-    def line(self, frame: int) -> str | None:
-        """At the end of each quarter of the frames, the time so far and that of the prediction; else None."""
-        share = frame / self.frames
-        if math.floor(4 * share) == math.floor(4 * (frame - 1) / self.frames) or frame == self.frames:
-            return None
-        stages = ("simulate",) if self.apart else ("simulate", "draw")
-        own = [part for part in self.predicted.parts if "estimated error" not in part.name]  # that run comes later
-        compiled = (p.seconds for p in own if p.stage == "compile" and p.name.partition(":")[0] in stages)
-        expected = math.fsum(compiled) + share * math.fsum(p.seconds for p in own if p.stage in stages)
-        spent = time.perf_counter() - self.begun
-        return f"frame {frame} of {self.frames}: {duration(spent)} since the first, {duration(expected)} predicted"
 
 
 def duration(seconds: float | int) -> str:

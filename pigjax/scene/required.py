@@ -26,7 +26,7 @@ from pigjax.scene.advice import default_dx
 from pigjax.scene.arrangement import arrange
 from pigjax.scene.costs import Body, Required
 from pigjax.scene.forces import forces_of
-from pigjax.scene.plan import Inputs, Plan, gravity_of, read_inputs, segment
+from pigjax.scene.plan import Inputs, Plan, gravity_of, masks_vote, read_inputs, segment
 from pigjax.scene.schema import Scene
 from pigjax.segmentation import Labels
 
@@ -72,7 +72,6 @@ class Survey:
     inputs: Inputs
     labels: Labels
     shapes: dict[str, Shape]  # of the objects that move
-    voted: bool  # whether the run lets masks vote
 
 
 def survey(scene: Scene) -> Survey:
@@ -89,16 +88,15 @@ def survey(scene: Scene) -> Survey:
         InputError: as `read_inputs` and `segment`.
     """
     inputs = read_inputs(scene)
-    asked = [name for name, e in scene.objects.items() if e.gaussians is None and e.within is None]
-    voted = inputs.stored is None and inputs.views is not None and inputs.labels is None and bool(asked)
-    labels = _quick_labels(scene, inputs) if voted else segment(scene, inputs)
+    known = inputs.labels is not None or not masks_vote(inputs)
+    labels = segment(scene, inputs) if known else _quick_labels(scene, inputs)
     scene, inputs, labels = arrange(scene, inputs, labels)
     labels, _ = cut_outliers(
         inputs.gaussians, labels, {inputs.ids[name]: entry.keep for name, entry in scene.objects.items()}
     )
     object_id, means = np.asarray(labels.object_id), np.asarray(inputs.gaussians.means, np.float64)
     shapes = {name: shape_of(means[object_id == inputs.ids[name]]) for name, e in scene.objects.items() if not e.fixed}
-    return Survey(scene, inputs, labels, shapes, voted)
+    return Survey(scene, inputs, labels, shapes)
 
 
 def _quick_labels(scene: Scene, inputs: Inputs) -> Labels:
@@ -220,7 +218,7 @@ def required_by(survey: Survey, scene: Scene | None = None) -> Required:
     )
     return _required(
         scene, inputs, survey.labels, bodies, values[:, :3], dx,
-        substeps=rule.first, integrator=rule.config.integrator, voted=survey.voted, guessed=True,
+        substeps=rule.first, integrator=rule.config.integrator, guessed=True,
     )  # fmt: skip
 
 
@@ -248,7 +246,7 @@ def _forces(scene: Scene, particles: Particles, names: list[str]) -> tuple[Force
         return ()
 
 
-def counted(scene: Scene, inputs: Inputs, plan: Plan, *, substeps: int, integrator: str, voted: bool) -> Required:
+def counted(scene: Scene, inputs: Inputs, plan: Plan, *, substeps: int, integrator: str) -> Required:
     """What a scene requires, counted from its particles.
 
     Args:
@@ -257,7 +255,6 @@ def counted(scene: Scene, inputs: Inputs, plan: Plan, *, substeps: int, integrat
         plan: of the scene.
         substeps: of the first frame.
         integrator: that was chosen.
-        voted: whether masks voted.
     """
     rows, volumes = np.asarray(plan.particles.material), np.asarray(plan.particles.volume0, np.float64)
     names = [name for name, entry in scene.objects.items() if not entry.fixed]
@@ -268,7 +265,7 @@ def counted(scene: Scene, inputs: Inputs, plan: Plan, *, substeps: int, integrat
     ]
     return _required(
         scene, inputs, plan.labels, bodies, np.asarray(plan.particles.x, np.float64), plan.dx,
-        substeps=substeps, integrator=integrator, voted=voted, guessed=False,
+        substeps=substeps, integrator=integrator, guessed=False,
     )  # fmt: skip
 
 
@@ -282,7 +279,6 @@ def _required(
     *,
     substeps: int,
     integrator: str,
-    voted: bool,
     guessed: bool,
 ) -> Required:
     spec, drawing, views = scene.simulation, scene.drawing, inputs.views
@@ -311,7 +307,7 @@ def _required(
         pixels=_pixels(scene),
         photos=photos,
         photo_pixels=pixels,
-        voted=voted,
+        voted=masks_vote(inputs),
         filled=int(np.isin(object_id, [inputs.ids[name] for name, entry in scene.objects.items() if entry.fill]).sum()),
         contact=spec.contact_friction is not None and len(bodies) > 1,
         forces=len(scene.forces),

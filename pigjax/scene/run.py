@@ -30,10 +30,10 @@ from pigjax.mpm.sleep import Sleeper
 from pigjax.objects.overlay import legend_sheet, overlay
 from pigjax.scene.advice import plan_line
 from pigjax.scene.arrangement import arrange
-from pigjax.scene.budget import ScenePlan, refined
-from pigjax.scene.costs import Comparison, Pace, Prediction, predict
+from pigjax.scene.budget import ScenePlan
 from pigjax.scene.health import MARK, Record, health_record, remarks, summary
 from pigjax.scene.own import MADE, Surfaces, chosen, is_torn, laws_of, surfaces_of, waits_for_motion, with_own
+from pigjax.scene.pace import Pace, Progress, Say
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
 from pigjax.scene.replay import COLLIDER_FILE, REST_FILE, SCENE_FILE, rows_of, store_colliders, store_rest
 from pigjax.scene.report import RunReport
@@ -53,8 +53,6 @@ _FILES = (
     "video.mp4", "contact_sheet.png", "objects.png", "labels.npz", COLLIDER_FILE, REST_FILE, SCENE_FILE, "report.json",
     "report.html",
 )  # fmt: skip
-Progress = Callable[[str, int, int], None]  # stage, done, of
-Say = Callable[[str], None]  # a line to read before the long work
 
 
 @checked
@@ -92,11 +90,11 @@ def run_scene(
     """
     out = io.output_folder(out_dir, files=_FILES, folders=("states",))
     report = RunReport()
-    tell = progress or (lambda stage, done, of: None)
+    tell = Pace(progress, say, planned)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            _run(scene, out, report, tell, say or (lambda line: None), overwrite, planned)
+            _run(scene, out, report, tell, say or (lambda line: None), overwrite)
         except StaleError:
             raise  # report.json still tells of the results that are there
         except BaseException as error:
@@ -119,10 +117,9 @@ def _run(
     scene: Scene,
     out: Path,
     report: RunReport,
-    tell: Progress,
+    tell: Pace,
     say: Say,
     overwrite: bool,
-    planned: ScenePlan | None,
 ) -> None:
     with report.stage("read"):
         inputs = read_inputs(scene)
@@ -149,9 +146,8 @@ def _run(
         say(f"note: {remark}")
     report.warnings += plan.remarks
     stages = stages_of(plan, scene.simulation.frames)
-    prediction = _predict(scene, inputs, plan, stages, report, planned)
+    _predict(scene, inputs, plan, stages, report, tell)
     say(report.plan)
-    told = say if planned is not None else None
     seen, shown, surfaces, laws = inputs, plan, None, laws_of(scene, plan)
     own_wanted = any(entry.splats != "carried" for entry in scene.objects.values())
 
@@ -175,7 +171,7 @@ def _run(
         if own_wanted:
             make_own()
         pictures = _Pictures.of(scene, seen, shown)
-    states = _simulate(scene, plan, stages, out / "states", parts, key, report, tell, told, prediction)
+    states = _simulate(scene, plan, stages, out / "states", parts, key, report, tell)
     followed = None
     if frames := min(scene.output.error_frames, scene.simulation.frames):
         followed = Followed(np.asarray(plan.particles.gaussian), frames, out / "states", key)
@@ -198,33 +194,16 @@ def _run(
             report.warnings.append(
                 "output.error_frames: nothing moved, or no state was there, so that no error is estimated."
             )
-    _compare(report, prediction, told)
+    tell.end(report)
 
 
-def _predict(
-    scene: Scene, inputs: Inputs, plan: Plan, stages: list[Stage], report: RunReport, planned: ScenePlan | None
-) -> Prediction:
+def _predict(scene: Scene, inputs: Inputs, plan: Plan, stages: list[Stage], report: RunReport, pace: Pace) -> None:
     """What the run requires and will cost, told by the report."""
     first = stages[0].rule
-    needs = counted(
-        scene, inputs, plan, substeps=first.first, integrator=first.config.integrator,
-        voted=inputs.stored is None and inputs.views is not None,
-    )  # fmt: skip
-    prediction = predict(needs) if planned is None else refined(planned, needs)
+    needs = counted(scene, inputs, plan, substeps=first.first, integrator=first.config.integrator)
+    prediction = pace.counted(needs)
     report.plan = plan_line(needs, prediction)
     report.predicted |= prediction.as_dict() | {"required": {**asdict(needs), "bodies": list(map(list, needs.bodies))}}
-    return prediction
-
-
-def _compare(report: RunReport, prediction: Prediction, say: Say | None) -> None:
-    """The time spent beside the prediction; a run that went on from saved states did only a part."""
-    spent = Comparison(
-        prediction,
-        {name: t.run for name, t in report.times.items()},
-        {name: t.compile for name, t in report.times.items()},
-    )
-    if say is not None and not report.sizes.get("resumed_from_frame"):
-        say(spent.line())
 
 
 def _store(
@@ -323,8 +302,6 @@ def _simulate(
     key: str,
     report: RunReport,
     tell: Progress,
-    say: Say | None,
-    prediction: Prediction,
 ) -> Iterator[int]:
     """Simulate the frames that are not on disk yet, from the last checkpoint on; yields the last one that is there.
 
@@ -362,7 +339,6 @@ def _simulate(
             yield from run(resumed, frames=range(last, frames))
 
     tell("simulate", 0 if repaired else last, frames)
-    pace = Pace(prediction, frames, scene.output.states_every == 1)
     yield 0 if repaired else last
     for frame, after, _, health in todo():
         records[frame] = record = health_record(after, health, plan.gravity)
@@ -378,8 +354,6 @@ def _simulate(
             _checkpoint(checkpoint, frame, after, active, parts)
         if frame < frames:
             tell("simulate", frame, frames)
-        if say is not None and saved is None and (line := pace.line(frame)):
-            say(line)
         yield frame
     tell("simulate", frames, frames)
     most = max((int(record["substeps"]) for frame, record in records.items() if frame), default=stages[0].rule.first)
