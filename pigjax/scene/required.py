@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -284,7 +284,11 @@ def _required(
     spec, drawing, views = scene.simulation, scene.drawing, inputs.views
     bodies = tuple(bodies)
     object_id = np.asarray(labels.object_id)
-    of_kind = {fixed: _members(object_id, inputs.ids, scene, fixed=fixed) for fixed in (False, True)}
+
+    def gaussians_of(names: Iterable[str]) -> int:
+        return int(np.isin(object_id, [inputs.ids[name] for name in names]).sum())
+
+    still = [name for name, entry in scene.objects.items() if entry.fixed]
     sides = np.ceil((x.max(0) - x.min(0)) / dx) + _AROUND
     nodes = math.prod(int(-(-side * _ROOM // _UNIT)) * _UNIT for side in sides)
     total = inputs.gaussians.sh.shape[1]
@@ -299,16 +303,16 @@ def _required(
         frames=frames,
         substeps=substeps,
         gaussians=len(inputs.gaussians),
-        moving=int(of_kind[False].sum()),
-        still=int(of_kind[True].sum()),
-        still_objects=sum(entry.fixed for entry in scene.objects.values()),
+        moving=gaussians_of(name for name in scene.objects if name not in still),
+        still=gaussians_of(name for name in still),
+        still_objects=len(still),
         sh_coefficients=drawn,
         colliders=len(scene.colliders()),
         pixels=_pixels(scene),
         photos=photos,
         photo_pixels=pixels,
         voted=masks_vote(inputs),
-        filled=int(np.isin(object_id, [inputs.ids[name] for name, entry in scene.objects.items() if entry.fill]).sum()),
+        filled=gaussians_of(name for name, entry in scene.objects.items() if entry.fill),
         contact=spec.contact_friction is not None and len(bodies) > 1,
         forces=len(scene.forces),
         integrator=integrator,
@@ -323,10 +327,3 @@ def _required(
         error_frames=min(scene.output.error_frames, frames),
         guessed=guessed,
     )
-
-
-def _members(
-    object_id: Int[np.ndarray, "n"], ids: Mapping[str, int], scene: Scene, *, fixed: bool
-) -> Bool[np.ndarray, "n"]:
-    numbers = [ids[name] for name, entry in scene.objects.items() if entry.fixed == fixed]
-    return np.isin(object_id, numbers)

@@ -31,7 +31,7 @@ from pigjax.objects.overlay import legend_sheet, overlay
 from pigjax.scene.advice import plan_line
 from pigjax.scene.arrangement import arrange
 from pigjax.scene.budget import ScenePlan
-from pigjax.scene.health import MARK, Record, health_record, remarks, summary
+from pigjax.scene.health import MARK, Record, drift, health_record, remarks, summary
 from pigjax.scene.own import MADE, Surfaces, chosen, is_torn, laws_of, surfaces_of, waits_for_motion, with_own
 from pigjax.scene.pace import Pace, Progress, Say
 from pigjax.scene.plan import Inputs, Plan, make_cameras, make_plan, provenance, read_inputs, render_config, segment
@@ -81,7 +81,8 @@ def run_scene(
             a line each; they are in the report, too.
         overwrite: replace states in `out_dir` that were made from something else, instead of refusing them.
         planned: of `plan_scene`; `scene` is usually its `scene`. The run then tells the time of this machine, and
-            compares it with the time spent, at each quarter of the simulation and at the end.
+            compares it with the time spent, at the end of each stage and at each quarter of the frames, and warns where
+            the budget will be broken.
 
     Raises:
         StaleError: the states in `out_dir` were made from other settings or files; it names what changed.
@@ -318,7 +319,7 @@ def _simulate(
     missing = set(range(last + 1)) - present  # of a run without a checkpoint all frames from the first are made again
     repaired = 0 if saved is None else max(missing, default=0)
     # of all frames, as their states may not stay on disk
-    records = {0: health_record(particles, None, plan.gravity)} | _records(folder, present, key)
+    records = {0: health_record(particles, None, plan.gravity, plan.table)} | _records(folder, present, key)
     half = scene.output.compress_states
     if saved is None or 0 in missing:
         _save(folder, 0, particles, records[0], key, half=half)
@@ -341,7 +342,7 @@ def _simulate(
     tell("simulate", 0 if repaired else last, frames)
     yield 0 if repaired else last
     for frame, after, _, health in todo():
-        records[frame] = record = health_record(after, health, plan.gravity)
+        records[frame] = record = health_record(after, health, plan.gravity, plan.table)
         if health.is_broken():
             report.health |= summary({number: known for number, known in records.items() if number <= frame})
             raise SimulationError(
@@ -358,7 +359,7 @@ def _simulate(
     tell("simulate", frames, frames)
     most = max((int(record["substeps"]) for frame, record in records.items() if frame), default=stages[0].rule.first)
     report.sizes |= {"substeps_per_frame": most, "last_grid": active.shape, "resumed_from_frame": last}
-    report.health |= summary(records)
+    report.health |= summary(records) | {"drift": drift(records, plan)}
     driven = bool(plan.forces) or any(collider.moves for collider in plan.colliders)
     report.warnings += remarks(report.health, driven=driven)
     if isinstance(active, Sleeper):

@@ -187,12 +187,13 @@ def test_a_run_is_told_beside_its_prediction_and_a_late_one_warns_once():
         pace(stage, 0, 1)
         pace(stage, 1, 1)
     with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
         for stage, of in (("simulate", 10), ("draw", 11)):
             for frame in range(of + 1):
                 now[0] += 1.0
                 pace(stage, frame, of)
     (late,) = warned
-    assert "about 11 s in all, more than the 10 s of its budget" in str(late.message)
+    assert "about 11 s in all, more than the 10 s that it may take" in str(late.message)
     lines = [line for line in said if not line.startswith("note: ")]
     assert [line.partition(":")[0] for line in lines] == [
         "segment", "seed", "simulate 3 of 10", "simulate 5 of 10", "simulate 8 of 10", "simulate",
