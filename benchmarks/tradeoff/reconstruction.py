@@ -1,5 +1,6 @@
 """Reconstruction: the error of held-out photos against time, for splats, steps, bands of colour and size of photos."""
 
+import sys
 import time
 from functools import partial
 
@@ -42,7 +43,7 @@ def study(options) -> str:
     for name, setting in settings.items():
         jax.clear_caches()
         points.append(_fitted(name, setting, full))
-        print(f"{points[-1].name}: {points[-1].seconds:.0f} s, {points[-1].note}", flush=True)
+        print(f"{points[-1].name}: {points[-1].seconds:.0f} s, {points[-1].note}", file=sys.stderr)  # not into the page
     print("\n" + table(points, error="RMS error of colour"))
     plot({"tabletop": points}, options.media / PLOT, error="RMS error of held-out photos")
     return f"\n{picture(PLOT, 'error against time')}"
