@@ -16,8 +16,10 @@ from typing import Any, NamedTuple
 
 from pigjax import io
 
-STAGES = ("read", "segment", "seed", "simulate", "draw")
-PROBE_OF = {"read": "host", "segment": "picture", "seed": "host", "simulate": "step", "draw": "picture"}
+STAGES = ("read", "segment", "seed", "splats", "simulate", "draw")
+PROBE_OF = {
+    "read": "host", "segment": "picture", "seed": "host", "splats": "picture", "simulate": "step", "draw": "picture",
+}  # fmt: skip
 IMPLICIT = 400  # explicit steps in the time of an implicit one, by benchmarks/implicit.py
 ESTIMATE = "estimated error: "  # prefix of the parts of the run that estimates the error
 _STATE_BYTES, _HALF_STATE_BYTES = 60, 36  # x, v and F_visual of a particle; the latter two in half precision
@@ -41,7 +43,7 @@ class Required:
 
     bodies: tuple[Body, ...]
     dx: float  # grid spacing [m]
-    nodes: int  # of the active grid at the start
+    nodes: int  # of the active grid, in the mean over frames
     frames: int
     substeps: int  # of the first frame
     gaussians: int
@@ -53,6 +55,14 @@ class Required:
     pixels: int  # of a picture of the video
     photos: int = 0
     photo_pixels: int = 0  # of all photos
+    most_nodes: int = 0  # of the largest active grid
+    windows: int = 1  # sizes of the active grid, for each of which the simulation is compiled
+    redrawn: float = 1.0  # share of the picture that each frame draws anew: less where camera and light are still
+    own: int = 0  # splats that objects get of their own, about
+    refitted: int = 0  # of these, fitted to pictures
+    refits: int = 0  # objects whose own splats are fitted
+    smooth: int = 0  # particles of fluids with a smooth surface
+    light: int = 0  # directions from which moving matter casts shadows
     voted: bool = False  # whether masks of photos vote
     filled: int = 0  # Gaussians of objects whose hidden surface is closed
     contact: bool = False  # between bodies
@@ -183,7 +193,7 @@ def run_parts(needs: Required) -> list[Part]:
         needs: of the scene.
     """
     pictures, steps = needs.frames + 1, needs.frames * needs.substeps
-    bodies = len(needs.bodies)
+    bodies, shown = len(needs.bodies), needs.gaussians + needs.own
     parts = [
         Part("read", "start", 1),
         Part("read", "Gaussians", needs.gaussians),
@@ -199,13 +209,18 @@ def run_parts(needs: Required) -> list[Part]:
     parts.append(Part("segment", "Gaussians of filled objects", needs.filled))
     parts += _steps(needs, steps)
     parts += [
+        Part("splats", "objects", needs.refits),
+        Part("splats", "splats that are fitted", needs.refitted),
         Part("simulate", "frames", needs.frames),
         Part("simulate", "states on disk", needs.states * needs.particles),
         Part("draw", "pictures", pictures),
-        Part("draw", "Gaussians", pictures * needs.gaussians * (needs.alpha_min / _ALPHA) ** -0.08),
-        Part("draw", "colour bands", pictures * needs.gaussians * needs.sh_coefficients),
-        Part("draw", "Gaussians that move", pictures * needs.moving),
-        Part("draw", "pixels", pictures * needs.pixels),
+        Part("draw", "Gaussians", pictures * shown * (needs.alpha_min / _ALPHA) ** -0.08),
+        Part("draw", "colour bands", pictures * shown * needs.sh_coefficients),
+        Part("draw", "Gaussians that move", pictures * (needs.moving + needs.own)),
+        Part("draw", "pixels", (1 + needs.frames * needs.redrawn) * needs.pixels),
+        Part("draw", "Gaussians in pixels", (1 + needs.frames * needs.redrawn) * shown),
+        Part("draw", "smooth surfaces", pictures * needs.smooth),
+        Part("draw", "shadows", pictures * shown * needs.light),
     ]
     if needs.error_frames:
         coarse = needs.error_frames * needs.substeps / _COARSER
@@ -242,11 +257,13 @@ def compile_parts(needs: Required) -> list[Part]:
         Part("segment", "filling", int(needs.filled > 0)),
         Part("seed", "start", 1),
         Part("seed", "still objects", needs.still_objects),
-        Part("simulate", "start", 1),
-        Part("simulate", "laws", len(needs.particles_of_law)),
-        Part("simulate", "colliders", needs.colliders + needs.still_objects),
-        Part("simulate", "contact of bodies", int(needs.contact)),
+        Part("splats", "fits", needs.refits),
+        Part("simulate", "start", needs.windows),
+        Part("simulate", "laws", needs.windows * len(needs.particles_of_law)),
+        Part("simulate", "colliders", needs.windows * (needs.colliders + needs.still_objects)),
+        Part("simulate", "contact of bodies", needs.windows * needs.contact),
         Part("draw", "start", 1),
+        Part("draw", "shadows", int(needs.light > 0)),
     ]
     if needs.error_frames:
         parts += [Part("simulate", ESTIMATE + part.name, part.amount) for part in parts if part.stage == "simulate"]
@@ -261,9 +278,12 @@ def memory_parts(needs: Required) -> dict[str, int]:
     """
     return {
         "start": 1,
-        "Gaussians": needs.gaussians,
+        "Gaussians": needs.gaussians + needs.own,
         "particles": needs.particles,
-        "nodes of the grid": needs.nodes * (len(needs.bodies) if needs.contact else 1),
+        "nodes of the grid": (needs.most_nodes or needs.nodes) * (len(needs.bodies) if needs.contact else 1),
+        "windows of the grid": needs.windows - 1,
+        "laws": len(needs.particles_of_law),
+        "splats that are fitted": needs.refitted,
         "pixels": needs.pixels,
         "pixels of photos": needs.photo_pixels,
     }

@@ -77,6 +77,33 @@ def test_what_a_scene_does_not_require_costs_nothing():
     assert {"contact of bodies", "forces", "estimated error: law neo_hookean"} <= added
 
 
+def test_own_splats_shadows_and_still_pictures_have_prices():
+    prices = shipped_prices()
+    plain = predict(NEEDS, prices)
+    own = predict(dataclasses.replace(NEEDS, own=4000, refitted=4000, refits=1), prices)
+    assert own.run["splats"] > plain.run["splats"] == 0
+    assert own.compile["splats"] > 0
+    assert own.run["draw"] > plain.run["draw"]
+    lit = predict(dataclasses.replace(NEEDS, light=8), prices)
+    assert lit.run["draw"] > predict(dataclasses.replace(NEEDS, light=1), prices).run["draw"] > plain.run["draw"]
+    still = predict(dataclasses.replace(NEEDS, redrawn=0.2), prices)
+    assert still.run["draw"] < plain.run["draw"]
+    twice = predict(dataclasses.replace(NEEDS, windows=2), prices)
+    assert twice.compile["simulate"] == pytest.approx(2 * plain.compile["simulate"])
+
+
+def test_a_scene_tells_its_own_splats_light_and_still_camera(scene):
+    far = merged(values(), {"camera": {"width": 480, "height": 400, "radius": 4.0}})
+    base = required_by(survey(scene_from(far, folder=scene.folder)))
+    assert 0.02 < base.redrawn < 0.3  # a ball of a tenth of the picture's width
+    assert (base.own, base.refits, base.light) == (0, 0, 0)
+    entry = {"ball": {"id": 1, "material": "sand", "splats": "auto", "refit": False}}
+    changes = {"objects": entry, "light": {"direction": [0, 0, -1]}, "camera": {"sweep": 90.0}}
+    more = required_by(survey(scene_from(merged(values(), changes), folder=scene.folder)))
+    assert (more.redrawn, more.light, more.refits) == (1.0, 8, 0)
+    assert more.own == 4 * more.particles
+
+
 def test_an_unknown_law_costs_what_the_dearest_does():
     foam = dataclasses.replace(NEEDS, bodies=(Body("cup", "foam", 1000, 8.0),))
     assert predict(foam, PRICES).run["simulate"] == pytest.approx(200 * 1000 * 3e-6)
@@ -272,7 +299,7 @@ def test_a_finer_grid_takes_more_of_everything(scene):
     fine = required_by(looked, budgets.changed(looked.scene, {"simulation": {"dx": 0.025}}))
     assert fine.particles > 1.5 * coarse.particles
     assert fine.substeps > coarse.substeps
-    assert fine.nodes > 4 * coarse.nodes
+    assert fine.nodes > 2 * coarse.nodes  # not eight times: some cells around matter are as many
     assert matter_error(fine) == pytest.approx(matter_error(coarse) / 2, rel=1e-6)
 
 
