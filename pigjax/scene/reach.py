@@ -157,9 +157,9 @@ def _front(law: str, size: np.ndarray, axis: int, pull: float, spread: float, im
     """Speed of the front of matter that collapses [m/s]: √(g h) of the height that is left, or that of its impact.
 
     Grains come to rest when they have gone as far as they were high (Lube et al. 2004, doi 10.1017/S0022112004009036),
-    and as far as friction lets their impact slide.
+    and half as far as they fell.
     """
-    if law != "fluid" and spread >= size[axis] + impact**2 / pull:
+    if law != "fluid" and spread >= size[axis] + impact**2 / (4 * pull):
         return 0.0
     shrunk = math.prod(side / (side + 2 * spread) for side in np.delete(size, axis).tolist() if side > 0)
     return max(math.sqrt(pull * float(size[axis]) * shrunk), impact)
