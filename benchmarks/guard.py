@@ -1,7 +1,8 @@
 """Guard: timings as ratios to a yardstick, programs compiled, and accuracy, beside those that were stored last.
 
     python -m benchmarks guard            # compare with the last entry of this kind of machine; warn beyond 15 %
-    python -m benchmarks guard timings --store
+    python -m benchmarks guard timings --store   # on a quiet machine: keep an entry of this commit
+    python -m benchmarks guard history           # entries of this kind of machine, and what changed between them
 
 Every window of a task of `benchmarks/common/yardsticks.py` stands beside one of a yardstick that is no part of pigjax
 (a product of matrices, exponentials, a scatter), so that load and clock cancel. `benchmarks/guard.json` holds an entry
@@ -9,6 +10,7 @@ for each commit and kind of machine. Programs and accuracy do not depend on the 
 `tests/benchmarks/test_guard.py` asserts them; timings only warn.
 """
 
+import itertools
 import json
 import os
 import platform
@@ -272,6 +274,32 @@ def compare(options):
         FILE.write_text(json.dumps(with_entry(entries, entry), indent=1, ensure_ascii=False) + "\n")
 
 
+def history(options):
+    """Print the stored ratios of this kind of machine by commit, and warn of each step from one to the next."""
+    own = kind()
+    entries = [entry for entry in stored() if entry["kind"] == own and entry["timings"]]
+    for line in history_of(entries):
+        print(line)
+
+
+def history_of(entries: list[dict[str, Any]]) -> list[str]:
+    """A table with a column for each of the last eight entries, and a line for each ratio that is more than 15 % off.
+
+    Args:
+        entries: of one kind of machine, oldest first.
+    """
+    if not entries:
+        return ["No entry of this kind of machine; `guard timings --store` adds one."]
+    last = entries[-8:]
+    names = dict.fromkeys(name for entry in last for name in entry["timings"])
+    lines = [head("task, in yardsticks", *(entry["commit"] for entry in last))]
+    lines += [row(name, *(f"{entry['timings'].get(name, '')}" for entry in last)) for name in names]
+    for before, after in itertools.pairwise(last):
+        told = warnings_of(after["timings"], before["timings"])
+        lines += [f"{before['commit']} to {after['commit']}: {line}" for line in told]
+    return lines
+
+
 def exact(options):
     """Print programs and accuracy beside the stored ones; end with 1 where one is worse."""
     entries = stored()
@@ -297,6 +325,7 @@ def worse(programs: dict[str, int], errors: dict[str, float], before: dict[str, 
 
 PARTS = {
     "timings": ("Timings in yardsticks", compare),
+    "history": ("Timings by commit", history),
     "exact": ("Programs and accuracy", exact),
 }
 OPTIONS = {

@@ -6,6 +6,7 @@ an environment with Taichi 1.7.4 and Warp 1.19, `--peers` the folder of their sc
 
 import json
 import subprocess
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,17 +15,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.common.pages import ROOT, head, row
+import pigjax as pj
+from benchmarks.common.pages import ROOT, TABLETOP, head, row
 from benchmarks.common.scopes import seconds_by_scope
 from benchmarks.common.timing import in_turn, peak_memory, timed
 from pigjax.mls_mpm import SimConfig, rollout
 from pigjax.mpm import Grid, fit_grid, make_particles
-from pigjax.mpm.active_grid import ActiveGrid
+from pigjax.mpm.active_grid import ActiveGrid, choose_box
 from pigjax.mpm.colliders import Plane
 from pigjax.mpm.contact import BodyContact
 from pigjax.mpm.materials import LAWS, TEARING, Material, material_table
 from pigjax.mpm.program import StepInputs
 from pigjax.mpm.sleep import Sleep, Sleeper
+from pigjax.mpm.timestep import choose_substeps
 
 DT = 1e-4  # the rivals' step
 ELASTIC = {"young": 1e5, "poisson": 0.2}
@@ -285,6 +288,54 @@ def _fall(count, nodes):
     return end
 
 
+def traced(options):
+    """Inside jit: the README's example, 8 frames, outside jit and inside, without a box and with one."""
+    particles, grid, table, world = _tabletop()
+    steps = choose_substeps(particles, grid, table, SimConfig(), frames=8, frame_dt=1 / 48, **world)
+    settings = SimConfig(substeps=steps)
+    run = partial(rollout, frames=8, frame_dt=1 / 48, **world)
+    _, path, _ = run(particles, grid, table, settings)
+    box = choose_box(particles, path, grid, table, frame_dt=1 / 48, gravity=world["gravity"])
+
+    def thrown(speed, config):
+        end, _, health = run(eqx.tree_at(lambda p: p.v, particles, speed * particles.v), grid, table, config)
+        return end.x, health.escaped
+
+    def inside(config, many=False):
+        one = partial(thrown, config=config)
+        return jax.jit(jax.vmap(one) if many else one)
+
+    kinds = {"no box": settings, 'box="auto"': replace(settings, box="auto"), "choose_box": replace(settings, box=box)}
+    single = {name: inside(config) for name, config in kinds.items()}
+    runs = {"outside": lambda: run(particles, grid, table, settings)[0].x}
+    runs |= {f"inside, {name}": partial(call, 1.0) for name, call in single.items()}
+    speeds = jnp.linspace(0.6, 1.0, 8)
+    for name in ("no box", "choose_box"):
+        alone, together = single[name], inside(kinds[name], many=True)
+        runs[f"8 one after another, {name}"] = lambda alone=alone: [alone(speed) for speed in speeds]
+        runs[f"8 by vmap, {name}"] = partial(together, speeds)
+    found = in_turn(runs, windows=3)
+    print(f"{len(particles)} particles, {steps} substeps a frame; nodes of the grid {grid.shape}, box {box}.\n")
+    print(head("rollout", "s", "to that outside", "held back"))
+    for name, each in found.items():
+        escaped = each.result[1] if isinstance(each.result, tuple) else 0
+        print(row(name, f"{each.seconds:.2f}", f"{each.over(found['outside']):.2f}", int(np.max(escaped))))
+
+
+def _tabletop():
+    """Particles of the duck and the ball, a grid with room, their table, and collider and gravity."""
+    views = pj.load_views(TABLETOP, masks=True, split="train")
+    gaussians = pj.load_ply(TABLETOP / "tabletop.ply")
+    labels = pj.lift_masks(gaussians, views.cameras, views.masks, num_ids=8)
+    matter = {2: pj.preset("jelly"), 3: pj.preset("rubber")}
+    particles, table = pj.seed_particles(
+        gaussians, labels, matter, spacing=0.016, velocities={2: (1.0, -0.5, 0.5)}
+    )  # fmt: skip
+    floor = Plane(point=(0, 0, 0.32), normal=(0, 0, 1), friction=0.4)
+    grid = fit_grid(particles.x, dx=0.016, margin=0.2)
+    return particles, grid, table, {"colliders": (floor,), "gravity": (0.0, 0.0, -9.81)}
+
+
 def memory(options):
     """Bytes of one compiled frame and of its gradient, and of the process."""
     print(head("case", "temporary and output bytes per particle", "gradient of 32 steps", "process peak MB"))
@@ -297,7 +348,7 @@ def memory(options):
         print(row(f"{count // 1000}k/{nodes}³", *total, f"{1e3 * peak_memory():.0f}"))
 
 
-STUDIES = (speed, stages, laws, gradient, domain, features, sleep, batch, memory)
+STUDIES = (speed, stages, laws, gradient, domain, features, sleep, batch, traced, memory)
 PARTS = {study.__name__: (study.__doc__.partition(":")[0].rstrip("."), study) for study in STUDIES}
 OPTIONS = {
     "laws": {"nargs": "+", "default": ["fixed_corotated", "neo_hookean"], "help": "of parts speed and stages"},

@@ -2,7 +2,7 @@
 
 `fit` runs small scenes, each in a process of its own without kept programs, and fits the prices of
 pigjax/scene/costs.json, which `--write` replaces; prices that no scene needs stay as they are. `check` plans and runs
-scenes that were not fitted on.
+scenes that were not fitted on. The plant, which the repository does not carry, lies in `--data`; see its scene file.
 """
 
 import json
@@ -20,6 +20,7 @@ from benchmarks.common.pages import EXAMPLES, ROOT, head, row
 from benchmarks.common.timing import machine, peak_memory
 from pigjax.io.compile_cache import SWITCH
 from pigjax.scene import costs, plan_scene, run_scene, scene_from
+from pigjax.scene.decode import merged
 from pigjax.scene.probe import probe
 
 PRICES = ROOT / "pigjax" / "scene" / "costs.json"
@@ -42,17 +43,70 @@ FITTED = {
     "sand cube, fine": Case("sand", {"simulation": {"dx": 0.0125, "frames": 3}}),
     "tabletop": Case("tabletop/scene.toml", {"simulation": {"dx": 0.02, "frames": 4}}),
     "rubber": Case("materials/rubber.toml", {"simulation": {"frames": 6}}),
-    "water": Case("materials/water.toml", {"simulation": {"frames": 6}, "output": {"error_frames": 6}}),
+    "smooth water": Case(
+        "materials/water.toml",
+        {
+            "simulation": {"frames": 6},
+            "objects": {"cube": {"splats": "own", "refit": False, "surface": "smooth"}},
+            "output": {"error_frames": 6},
+        },
+    ),
+    "own splats under a lamp": Case(
+        "elastic",
+        {
+            "simulation": {"frames": 4},
+            "objects": {"cube": {"splats": "own"}},
+            "light": {"direction": [0.3, 0.2, -1.0]},
+            "output": {"error_frames": 4},
+        },
+    ),
+    "snow cube": Case(
+        "elastic",
+        {
+            "simulation": {"frames": 8},
+            "objects": {"cube": {"model": "snow", "young": 1e5, "velocity": [3.0, 0.0, -3.0]}},
+            "output": {"error_frames": 8},
+        },
+    ),
 }
+_METAL = {"model": "von_mises", "density": 2000, "young": 2e5, "poisson": 0.3, "yield_stress": 2e3}
+_WATER = {"bottom": [0.3, 0.0, 0.1], "top": [0.3, 0.0, 0.3], "radius": 0.05, "material": "water", "bulk_modulus": 2e4}
+_SAND = {"lower": [-0.35, -0.06, 0.05], "upper": [-0.23, 0.06, 0.3], "material": "sand", "young": 2e5, "grain": 0.2}
 CHECKED = {
-    "breeze": Case("gallery/breeze.toml", {}),
-    "honey": Case("materials/honey.toml", {}),
-    "muscle": Case("materials/muscle.toml", {}),
-    "snow": Case("materials/snow.toml", {}),
-    "sand": Case("materials/sand.toml", {}),
-    "tabletop, draft": Case("tabletop/scene.toml", {"simulation": {"dx": 0.018, "cfl": 0.8},
-                                                    "drawing": {"scale": 0.5}}),
-}  # fmt: skip
+    "cup": Case("gallery/cup.toml", {"simulation": {"frames": 6}}),
+    "sweep": Case("gallery/sweep.toml", {"simulation": {"frames": 10}}),
+    "plant": Case("gallery/plant.toml", {"simulation": {"frames": 8}}),
+    "two cubes that collide": Case(
+        "elastic",
+        {
+            "simulation": {"frames": 12, "dx": 0.02, "contact_friction": 0.3},
+            "objects": {
+                "cube": {"model": "neo_hookean"},
+                "other": {"gaussians": "cube.ply", "offset": [0.35, 0.0, 0.0], "velocity": [-1.5, 0.0, -1.0], **_METAL},
+            },
+            "camera": {"sweep": 60.0, "width": 320, "height": 240},
+        },
+    ),
+    "snow under a lamp": Case(
+        "elastic",
+        {
+            "simulation": {"frames": 12, "dx": 0.02},
+            "objects": {"cube": {"model": "snow", "young": 2e5, "velocity": [2.0, 1.0, -2.0]}},
+            "light": {"direction": [-0.2, 0.4, -1.0], "softness": 0.0},
+            "camera": {"width": 320, "height": 320},
+        },
+    ),
+    "poured water and sand": Case(
+        "elastic",
+        {
+            "simulation": {"frames": 10},
+            "volumes": {
+                "water": {**_WATER, "colour": [0.2, 0.5, 0.8]},
+                "sand": {**_SAND, "colour": [0.8, 0.6, 0.3]},
+            },
+        },
+    ),
+}
 
 
 class Measured(NamedTuple):
@@ -71,7 +125,7 @@ def fit(options) -> None:
     """Run the scenes of the fit, print their times beside those of the fitted prices, and write these."""
     runs = {}
     for name in options.fitted:
-        if (found := _child(name, planned=False)) is not None:
+        if (found := _child(name)) is not None:
             runs[name] = found
     before = json.loads(PRICES.read_text())
     if not runs:
@@ -111,8 +165,24 @@ def fitted_prices(before: dict[str, Any], runs: list[Measured]) -> dict[str, Any
                 after[kind][stage] = least_squares(known, amounts, times)
     memory = [costs.memory_parts(r.needs) for r in runs]
     after["memory"] = least_squares(before["memory"], memory, [r.memory for r in runs])
+    after["error"] |= fitted_errors(costs.prices_from(before), runs)
     after["probe"] = {name: float(np.median([r.probe[name] for r in runs])) for name in runs[0].probe}
     return after
+
+
+def fitted_errors(before: costs.Prices, runs: list[Measured]) -> dict[str, float]:
+    """Errors of the laws of runs that measured their own, of one law each: the median where there are several.
+
+    Args:
+        before: prices so far.
+        runs: measured.
+    """
+    found: dict[str, list[float]] = {}
+    for run in runs:
+        law, *others = run.needs.particles_of_law
+        if run.error is not None and not others and (guess := costs.matter_error(run.needs, before)):
+            found.setdefault(law, []).append(before.error[law] * run.error / guess)
+    return {law: float(f"{np.median(values):.2g}") for law, values in found.items()}
 
 
 def least_squares(known: dict[str, float], amounts: list[dict[str, float]], values: list[float]) -> dict[str, float]:
@@ -141,7 +211,11 @@ def check(options) -> None:
     print(head("scene", "particles", "run s", "compile s", "GB", "error of motion"))
     ratios: dict[str, list[float]] = {"run": [], "compile": [], "memory": [], "error": [], "particles": []}
     for name in options.checked:
-        found = _child(name, planned=True)
+        case = CHECKED[name]
+        if "plant" in case.source and not _plant_in(options.data).is_file():
+            print(row(name, "skipped: no plant.ply in --data", *[""] * 4))
+            continue
+        found = _child(name, data=options.data)
         if found is None or found.planned is None:
             print(row(name, *["failed"] * 5))
             continue
@@ -164,9 +238,13 @@ def check(options) -> None:
             print(f"- {key}: {np.exp(np.abs(np.log(found)).max()):.2f}")
 
 
-def _child(name: str, *, planned: bool) -> Measured | None:
-    """Run a scene in a process of its own."""
-    child = start_worker("plan", name, "planned" if planned else "", env={**os.environ, **_COLD})
+def _plant_in(data: Path) -> Path:
+    return data.resolve() / "plant.ply"
+
+
+def _child(name: str, *, data: Path | None = None) -> Measured | None:
+    """Run a scene in a process of its own; one of the check, where there is a folder of data."""
+    child = start_worker("plan", name, data or "", env={**os.environ, **_COLD})
     said, _ = child.communicate()
     lines = said.strip().splitlines()
     if child.returncode or not lines:
@@ -177,15 +255,18 @@ def _child(name: str, *, planned: bool) -> Measured | None:
     return Measured(costs.Required(**needs), **values)
 
 
-def worker(name: str, planned: str = "") -> None:
+def worker(name: str, data: str = "") -> None:
     """Plan and run one scene, and print what was measured as JSON."""
     from benchmarks.common.timing import use_host_devices
 
     use_host_devices()
+    planned = bool(data)
     case = (CHECKED if planned else FITTED)[name]
+    if "plant" in case.source:
+        case.changes["input"] = {"gaussians": str(_plant_in(Path(data)))}
     fast = probe()
     with tempfile.TemporaryDirectory() as folder:
-        scene = scene_of(case, estimate=bool(planned))
+        scene = scene_of(case, estimate=planned)
         guess = None
         if planned:
             found = plan_scene(scene)
@@ -225,8 +306,7 @@ def scene_of(case: Case, *, estimate: bool = False):
     else:
         path = EXAMPLES / case.source
         values, folder = read_toml(path), path.parent
-    changed = {name: {**values.get(name, {}), **fields} for name, fields in case.changes.items()}
-    values = {**values, **changed}
+    values = merged(values, case.changes)
     if estimate:
         values["output"] = {**values.get("output", {}), "error_frames": values["simulation"]["frames"]}
     return scene_from(values, folder=folder)
@@ -236,5 +316,6 @@ PARTS = {"fit": ("Fit", fit), "check": ("Check", check)}
 OPTIONS = {
     "fitted": {"nargs": "+", "default": list(FITTED), "choices": FITTED, "help": "scenes of the fit"},
     "checked": {"nargs": "+", "default": list(CHECKED), "choices": CHECKED, "help": "scenes of the check"},
+    "data": {"type": Path, "default": ROOT / "shared" / "data" / "splats", "help": "folder of plant.ply"},
 }
 DEVICES = None

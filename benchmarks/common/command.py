@@ -15,7 +15,6 @@ import ast
 import importlib
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -86,18 +85,18 @@ def parser_of(name: str, module: ModuleType) -> argparse.ArgumentParser:
 
 def run(module: ModuleType, options: argparse.Namespace, command: str, changed: str, heading: str) -> None:
     """Print the chosen parts, each with its command, the machine and its cost, and write those asked for."""
-    from benchmarks.common.timing import machine, peak_memory, use_host_devices
+    from benchmarks.common.timing import machine, peak_memory, processor_time, use_host_devices
 
     use_host_devices(options.devices)
     for name in options.parts or module.PARTS:
         title, study = module.PARTS[name]
         print(f"\n## {title}\n")
-        worked = time.process_time()
+        worked = processor_time()
         with kept() as text:
             print(f"`{command} {name}{changed}`, {machine()}\n")
             if said := study(options):
                 print(said)
-            worked = time.process_time() - worked  # hardly depends on other jobs
+            worked = processor_time() - worked
             print(f"\n{worked:.0f} s of processor time, at most {peak_memory():.1f} GB.")
         if options.write:
             write_section(options.write, heading.rstrip("."), title, text.getvalue())

@@ -111,6 +111,13 @@ def machine() -> str:
 
 
 def peak_memory() -> float:
-    """Largest resident memory of this process so far [GB]."""
+    """Largest resident memory so far of this process, or of one that it started and that ended [GB]."""
     unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
+    kinds = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
+    return max(resource.getrusage(kind).ru_maxrss for kind in kinds) * unit / 1e9
+
+
+def processor_time() -> float:
+    """Processor time so far of this process and of all that it started and that ended [s]; load hardly changes it."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.common.timing import in_turn
 from benchmarks.tradeoff.errors import enlarged, root_mean_square, video_psnr
-from benchmarks.tradeoff.points import Point, by_scene
+from benchmarks.tradeoff.points import Point, by_scene, said_windows
 from benchmarks.tradeoff.scenes import as_float64, picture, pose, simulate, source
 from pigjax import prune
 from pigjax.scene.plan import make_cameras
@@ -27,12 +27,14 @@ CONFIGS = {
     "SH 0": ("SH degree", {"sh_degree": 0}),
     "SH 1": ("SH degree", {"sh_degree": 1}),
 }
+WINDOWS = 7
 SCALES, KEPT, ROOM = (0.75, 0.5), (0.75, 0.5), 0.8
 
 
 def study(options) -> str:
     """Tables of all scenes and one plot."""
     print(
+        f"{said_windows(WINDOWS)} "
         "One picture of the deformed scene. Reference: the exact setting (alpha ≥ 1e-6, no early stop) in float64. Of a"
         " smaller picture the error is measured after enlargement.\n"
     )
@@ -77,7 +79,7 @@ def _study(name):
 
     runs["float64"], knobs["float64"] = in_float64, "precision"
     points = []
-    for key, timed in in_turn(runs, windows=7).items():
+    for key, timed in in_turn(runs, windows=WINDOWS).items():
         image = np.asarray(timed.result)
         psnr, most = video_psnr(image[None], exact[None]), float(np.max(np.abs(_as_large(image, exact) - exact)))
         note = f"PSNR {psnr:.1f} dB, at most {most:.1e}"

@@ -3,11 +3,12 @@
 Each knob is turned alone from the standard, on the bundled tabletop, a jelly cube and a cube of sand (`--scenes`).
 """
 
-from benchmarks.tradeoff import drawing, matter, reconstruction, voting, whole
+from benchmarks.tradeoff import drawing, kernels, matter, reconstruction, voting, whole
 from benchmarks.tradeoff.scenes import SCENES
 
 PARTS = {
     "matter": ("Matter", matter.study),
+    "kernels": ("Kernels", kernels.study),
     "drawing": ("Drawing", drawing.study),
     "voting": ("Voting", voting.study),
     "reconstruction": ("Reconstruction", reconstruction.study),

@@ -32,6 +32,11 @@ def pareto(points: Sequence[Point]) -> set[str]:
     return best
 
 
+def said_windows(windows: int) -> str:
+    """How often each setting was timed, in a sentence."""
+    return "Times are of one warm run." if windows == 1 else f"Times are medians of {windows} warm runs taken in turn."
+
+
 def by_scene(options, study: Callable, file: str, *, error: str) -> str:
     """Tables of all scenes, printed as they come, and one plot; `study(name)` gives points, floor or None, and text."""
     panels, floors = {}, {}

@@ -9,7 +9,7 @@ from benchmarks.common.pages import picture
 from benchmarks.common.timing import in_turn
 from benchmarks.segmentation.tabletop import load_tabletop
 from benchmarks.tradeoff.errors import share_right
-from benchmarks.tradeoff.points import Point, plot, table
+from benchmarks.tradeoff.points import Point, plot, said_windows, table
 from pigjax.segmentation import enough_capacity, lift_masks
 from pigjax.splat import RenderConfig
 
@@ -28,6 +28,9 @@ SETTINGS = {
 }
 
 
+WINDOWS = 3
+
+
 def study(options) -> str:
     """Table and a plot; only the tabletop has more than one object."""
     if "tabletop" not in options.scenes:
@@ -35,7 +38,7 @@ def study(options) -> str:
     scene = load_tabletop()
     runs = {name: _vote(scene, **STANDARD | fields) for name, (_, fields) in SETTINGS.items()}
     points = []
-    for name, timed in in_turn(runs, windows=3).items():
+    for name, timed in in_turn(runs, windows=WINDOWS).items():
         found = np.asarray(timed.result)
         right = share_right(found, scene.truth)
         note = f"{100 * right:.2f} % right, {100 * np.mean(found < 0):.2f} % never seen"
@@ -43,6 +46,7 @@ def study(options) -> str:
     spread = _spread(scene)
     plot({"tabletop": points}, options.media / PLOT, error="share of wrong ids")
     head = (
+        f"{said_windows(WINDOWS)} "
         f"{len(scene.truth)} Gaussians with known ids, {len(scene.train)} views. Reference: the truth. Which views"
         f" they are moves the share of 8 views by {spread:.1e} (standard deviation over four disjoint sets). The small"
         " scenes have one object each, so nothing to vote on."

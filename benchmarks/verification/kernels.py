@@ -75,9 +75,10 @@ def kernels():
 
     A free bar of 16 cells oscillates in its first mode for 20 periods from 0.05 m/s; the energy kept is the mean over
     the last period divided by that over the first, since velocity and strain are half a step apart. A block of 6 cells
-    a side turns once. Both are in float64; 10k random particles on 64³ nodes in float32 give the time, on a busy
-    machine. APIC keeps only the affine part of the velocities around a particle, and the window of the cubic kernel is
-    wider: it damps the bar more and costs more. Its advantage is a smoother stress where particles cross cells.
+    a side turns once. Both are in float64; 10k random particles on 64³ nodes in float32 give the time.
+    APIC keeps only the affine part of the velocities around a particle, and the window of the cubic kernel is
+    wider: it damps the bar more and costs more. Its advantage is a smoother stress where particles cross cells
+    (`python -m benchmarks tradeoff kernels`).
     """
     rows, series = [], {}
     for kernel in KERNELS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -79,18 +80,30 @@ def plan(
             raise InputError(f"{out}: exists; give --overwrite to replace it, or another -o.")
     console.print(said("reading the scene ..."))
     found = plan_scene(asked, time=time, error=error, memory=memory)
-    tell(found, str(scene))
+    tell(found, _again(scene, accuracy, changes, found.settings, drop_invalid=drop_invalid))
     if out is not None:
         io.write_toml(out, values_of(found.scene, out.parent))
         console.print(said(f"written to {out}; pigjax run {out} keeps the plan"))
 
 
-def tell(found: ScenePlan, name: str) -> None:
-    """Print a plan: what the scene requires, prices, left out, prediction, settings.
+def _again(
+    scene: Path, accuracy: str | None, changes: list[str] | None, settings: list[str], *, drop_invalid: bool
+) -> str:
+    """The command that runs what was planned: every option that bears on the scene, and the settings chosen."""
+    replaced = {setting.partition("=")[0] for setting in settings}
+    own = [text for text in changes or () if text.partition("=")[0].strip() not in replaced]
+    words = ["pigjax", "run", str(scene)]
+    words += [] if accuracy is None else ["--accuracy", accuracy]
+    words += ["--drop-invalid"] * drop_invalid
+    return shlex.join([*words, *(word for text in [*own, *settings] for word in ("--set", text))])
+
+
+def tell(found: ScenePlan, command: str) -> None:
+    """Print a plan: what the scene requires, prices, left out, prediction, the command that keeps it.
 
     Args:
         found: of `plan_scene`.
-        name: of the scene file, for the command that keeps the plan.
+        command: that runs what was planned.
     """
     from pigjax.scene.advice import plan_line
 
@@ -103,9 +116,8 @@ def tell(found: ScenePlan, name: str) -> None:
         answers.print(_front(found))
     for line in _summary(found):
         answers.print(said(line), soft_wrap=True)
-    if found.settings:
-        settings = " ".join(f"--set {setting}" for setting in found.settings)
-        answers.print(said(f"pigjax run {name} {settings}"), soft_wrap=True)
+    if not found.budget.is_open:
+        answers.print(said(command), soft_wrap=True)
 
 
 def _prices(found: ScenePlan) -> Table:

@@ -14,6 +14,7 @@ from msgspec import structs
 from pigjax.core.arguments import checked
 from pigjax.core.checks import shown
 from pigjax.core.errors import InputError
+from pigjax.scene.accuracy import LEVELS
 from pigjax.scene.costs import Prediction, Prices, Required, duration, predict, shipped_prices
 from pigjax.scene.probe import speed_against
 from pigjax.scene.report import RunReport
@@ -23,7 +24,7 @@ from pigjax.scene.schema import Scene
 
 # knobs that are Pareto members of docs/results/TRADEOFF.md: factors on dx, a longer step, and drawings
 _COARSENINGS = (3.0, 2.0, 1.5, 1.2, 1.0, 0.85, 0.75, 0.5)
-_LONG_STEP = 0.8
+_LONG_STEP = 0.8  # a fluid that is compressed by 3 % breaks down at it, other laws at 0.9 and more (STABILITY.md)
 _DRAWINGS: tuple[dict[str, float], ...] = (
     {"scale": 0.5, "alpha_min": 1 / 64},
     {"scale": 0.75, "alpha_min": 1 / 64},
@@ -64,12 +65,16 @@ class Choice:
     changes: dict[str, dict[str, Any]]  # fields that differ from the scene's, by section
     required: Required
     prediction: Prediction
+    coarsening: float = 1.0  # factor of the scene's level of accuracy on the spacing that a file or `--set` gives
 
     @property
     def settings(self) -> list[str]:
-        """The changes as `--set` takes them: "simulation.dx=0.018"."""
-        return [f"{section}.{name}={value:g}" for section, fields in self.changes.items() for name, value in
-                fields.items()]  # fmt: skip
+        """The changes as `--set` takes them, at the scene's level of accuracy: "simulation.dx=0.018"."""
+        return [
+            f"{section}.{name}={value / (self.coarsening if name == 'dx' else 1):.9g}"  # 9 digits: dx of the run in 8
+            for section, fields in self.changes.items()
+            for name, value in fields.items()
+        ]
 
     @property
     def cost(self) -> tuple[float, float]:
@@ -102,7 +107,7 @@ class ScenePlan:
 
     @property
     def settings(self) -> list[str]:
-        """Fields that the budget changed, as `--set` takes them."""
+        """Fields that the budget changed, as `--set` takes them beside the scene's own level of accuracy."""
         return self.chosen.settings
 
 
@@ -120,8 +125,8 @@ def plan_scene(
     The scene is read; its particles are estimated, not seeded, and masks are looked up in some photos, where the run
     lets all vote. With a bound on the error the quickest settings that keep the budget are chosen. Otherwise the
     scene's own stay where they keep it, and where they do not the most accurate ones that do are taken. Settings come
-    from the front that `benchmarks/tradeoff` measured: `simulation.dx`, `simulation.cfl`, `drawing.scale` and
-    `drawing.alpha_min`.
+    from the front that `benchmarks/tradeoff` measured: `simulation.dx`, `drawing.scale`, `drawing.alpha_min` and,
+    where nothing is a fluid, `simulation.cfl`.
 
         plan = pj.plan_scene(pj.load_scene("scene.toml"), time="1 min")
         pj.run_scene(plan.scene, "out", planned=plan)
@@ -152,7 +157,7 @@ def plan_scene(
         if matter not in known:
             known[matter] = required_by(looked, there)
         needs = drawn(known[matter], there)
-        return Choice(changes, needs, predict(needs, prices, speed=speed or None))
+        return Choice(changes, needs, predict(needs, prices, speed=speed or None), LEVELS[scene.accuracy].coarsening)
 
     given = choice({})
     choices = [given]
@@ -193,7 +198,8 @@ def candidates(
         given: what they require.
         choice: predicts changed settings.
     """
-    steps = [scene.simulation.cfl] + [_LONG_STEP] * (scene.simulation.cfl < _LONG_STEP)
+    longer = scene.simulation.cfl < _LONG_STEP and "fluid" not in given.particles_of_law
+    steps = [scene.simulation.cfl] + [_LONG_STEP] * longer
     drawings = list({tuple(_drawing(scene, fields).items()): _drawing(scene, fields) for fields in _DRAWINGS}.values())
     for factor, cfl in product(_COARSENINGS, steps):
         matter: dict[str, Any] = {} if factor == 1 else {"dx": float(f"{given.dx * factor:.3g}")}
@@ -252,10 +258,9 @@ def choose(budget: Budget, choices: list[Choice]) -> Choice:
 
 def _refusal(budget: Budget, choices: list[Choice]) -> str:
     """The budget, and the nearest choices: for each bound, the best that the others leave, and the least broken."""
-    asked = ", ".join(text for text in _asked(budget) if text)
     nearest = min(choices, key=lambda c: budget.broken_by(c.prediction))
     settings = ", ".join(nearest.settings) or "the scene's own settings"
-    found = [f"the nearest is {_told(nearest.prediction)} with {settings}"]
+    found = [f"the nearest is {told(nearest.prediction)} with {settings}"]
     quickest = min(choices, key=lambda c: c.prediction.seconds)
     if budget.time is not None and quickest.prediction.seconds > budget.time:
         found.append(f"no setting takes less than {duration(quickest.prediction.seconds)}")
@@ -266,18 +271,31 @@ def _refusal(budget: Budget, choices: list[Choice]) -> str:
     smallest = min(choices, key=lambda c: c.prediction.memory)
     if budget.memory is not None and smallest.prediction.memory > budget.memory:
         found.append(f"no setting takes less than {smallest.prediction.memory / 1e9:.2g} GB")
-    return f"{asked} cannot be kept: {'; '.join(found)}. Ask for that, or take fewer frames or smaller pictures."
+    return (
+        f"{asked(budget)} cannot be kept: {'; '.join(found)}. Ask for that, or take fewer frames or smaller pictures."
+    )
 
 
-def _asked(budget: Budget) -> list[str]:
-    return [
+def asked(budget: Budget) -> str:
+    """The bounds of a budget in words.
+
+    Args:
+        budget: with one bound or more.
+    """
+    texts = (
         "" if budget.time is None else f"time = {budget.time:g} s",
         "" if budget.error is None else f"error = {_percent(budget.error)}",
         "" if budget.memory is None else f"memory = {budget.memory / 1e9:g} GB",
-    ]
+    )
+    return ", ".join(text for text in texts if text)
 
 
-def _told(prediction: Prediction) -> str:
+def told(prediction: Prediction) -> str:
+    """Time, error and memory of a prediction in words.
+
+    Args:
+        prediction: of a run.
+    """
     worst = max(prediction.error, prediction.picture_error)
     return f"{duration(prediction.seconds)}, an error of {_percent(worst)} and {prediction.memory / 1e9:.2g} GB"
 

@@ -8,20 +8,23 @@ those of each stage are multiplied by the ratio of a small task of the same kind
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from pigjax import io
 
-STAGES = ("read", "segment", "seed", "simulate", "draw")
-PROBE_OF = {"read": "host", "segment": "picture", "seed": "host", "simulate": "step", "draw": "picture"}
+STAGES = ("read", "segment", "seed", "splats", "simulate", "draw")
+PROBE_OF = {
+    "read": "host", "segment": "picture", "seed": "host", "splats": "picture", "simulate": "step", "draw": "picture",
+}  # fmt: skip
 IMPLICIT = 400  # explicit steps in the time of an implicit one, by benchmarks/implicit.py
+ESTIMATE = "estimated error: "  # prefix of the parts of the run that estimates the error
 _STATE_BYTES, _HALF_STATE_BYTES = 60, 36  # x, v and F_visual of a particle; the latter two in half precision
 _ALPHA = 1 / 255  # thresholds of the measured standard
+_FLUID_CFL = 0.6  # above which longer steps of a fluid gain no accuracy
 _COARSER = 1.5  # dx of the run that estimates the error, over that of the run itself
 
 
@@ -40,7 +43,7 @@ class Required:
 
     bodies: tuple[Body, ...]
     dx: float  # grid spacing [m]
-    nodes: int  # of the active grid at the start
+    nodes: int  # of the active grid, in the mean over frames
     frames: int
     substeps: int  # of the first frame
     gaussians: int
@@ -52,6 +55,14 @@ class Required:
     pixels: int  # of a picture of the video
     photos: int = 0
     photo_pixels: int = 0  # of all photos
+    most_nodes: int = 0  # of the largest active grid
+    windows: int = 1  # sizes of the active grid, for each of which the simulation is compiled
+    redrawn: float = 1.0  # share of the picture that each frame draws anew: less where camera and light are still
+    own: int = 0  # splats that objects get of their own, about
+    refitted: int = 0  # of these, fitted to pictures
+    refits: int = 0  # objects whose own splats are fitted
+    smooth: int = 0  # particles of fluids with a smooth surface
+    light: int = 0  # directions from which moving matter casts shadows
     voted: bool = False  # whether masks of photos vote
     filled: int = 0  # Gaussians of objects whose hidden surface is closed
     contact: bool = False  # between bodies
@@ -182,7 +193,7 @@ def run_parts(needs: Required) -> list[Part]:
         needs: of the scene.
     """
     pictures, steps = needs.frames + 1, needs.frames * needs.substeps
-    bodies = len(needs.bodies)
+    bodies, shown = len(needs.bodies), needs.gaussians + needs.own
     parts = [
         Part("read", "start", 1),
         Part("read", "Gaussians", needs.gaussians),
@@ -198,22 +209,24 @@ def run_parts(needs: Required) -> list[Part]:
     parts.append(Part("segment", "Gaussians of filled objects", needs.filled))
     parts += _steps(needs, steps)
     parts += [
+        Part("splats", "objects", needs.refits),
+        Part("splats", "splats that are fitted", needs.refitted),
         Part("simulate", "frames", needs.frames),
         Part("simulate", "states on disk", needs.states * needs.particles),
         Part("draw", "pictures", pictures),
-        Part("draw", "Gaussians", pictures * needs.gaussians * (needs.alpha_min / _ALPHA) ** -0.08),
-        Part("draw", "colour bands", pictures * needs.gaussians * needs.sh_coefficients),
-        Part("draw", "Gaussians that move", pictures * needs.moving),
-        Part("draw", "pixels", pictures * needs.pixels),
+        Part("draw", "Gaussians", pictures * shown * (needs.alpha_min / _ALPHA) ** -0.08),
+        Part("draw", "colour bands", pictures * shown * needs.sh_coefficients),
+        Part("draw", "Gaussians that move", pictures * (needs.moving + needs.own)),
+        Part("draw", "pixels", (1 + needs.frames * needs.redrawn) * needs.pixels),
+        Part("draw", "Gaussians in pixels", (1 + needs.frames * needs.redrawn) * shown),
+        Part("draw", "smooth surfaces", pictures * needs.smooth),
+        Part("draw", "shadows", pictures * shown * needs.light),
     ]
     if needs.error_frames:
         coarse = needs.error_frames * needs.substeps / _COARSER
-        parts += [
-            Part("simulate", f"estimated error: {part.name}", part.amount / _COARSER**3)
-            for part in _steps(needs, coarse)
-        ]
-        parts.append(Part("seed", "estimated error: Gaussians that move", needs.moving))
-        parts.append(Part("seed", "estimated error: objects that move", bodies))
+        parts += [Part("simulate", ESTIMATE + part.name, part.amount / _COARSER**3) for part in _steps(needs, coarse)]
+        parts.append(Part("seed", ESTIMATE + "Gaussians that move", needs.moving))
+        parts.append(Part("seed", ESTIMATE + "objects that move", bodies))
     return [part for part in parts if part.amount]
 
 
@@ -244,16 +257,16 @@ def compile_parts(needs: Required) -> list[Part]:
         Part("segment", "filling", int(needs.filled > 0)),
         Part("seed", "start", 1),
         Part("seed", "still objects", needs.still_objects),
-        Part("simulate", "start", 1),
-        Part("simulate", "laws", len(needs.particles_of_law)),
-        Part("simulate", "colliders", needs.colliders + needs.still_objects),
-        Part("simulate", "contact of bodies", int(needs.contact)),
+        Part("splats", "fits", needs.refits),
+        Part("simulate", "start", needs.windows),
+        Part("simulate", "laws", needs.windows * len(needs.particles_of_law)),
+        Part("simulate", "colliders", needs.windows * (needs.colliders + needs.still_objects)),
+        Part("simulate", "contact of bodies", needs.windows * needs.contact),
         Part("draw", "start", 1),
+        Part("draw", "shadows", int(needs.light > 0)),
     ]
     if needs.error_frames:
-        parts += [
-            Part("simulate", f"estimated error: {part.name}", part.amount) for part in parts if part.stage == "simulate"
-        ]
+        parts += [Part("simulate", ESTIMATE + part.name, part.amount) for part in parts if part.stage == "simulate"]
     return [part for part in parts if part.amount]
 
 
@@ -265,9 +278,12 @@ def memory_parts(needs: Required) -> dict[str, int]:
     """
     return {
         "start": 1,
-        "Gaussians": needs.gaussians,
+        "Gaussians": needs.gaussians + needs.own,
         "particles": needs.particles,
-        "nodes of the grid": needs.nodes * (len(needs.bodies) if needs.contact else 1),
+        "nodes of the grid": (needs.most_nodes or needs.nodes) * (len(needs.bodies) if needs.contact else 1),
+        "windows of the grid": needs.windows - 1,
+        "laws": len(needs.particles_of_law),
+        "splats that are fitted": needs.refitted,
         "pixels": needs.pixels,
         "pixels of photos": needs.photo_pixels,
     }
@@ -313,7 +329,7 @@ def predict(needs: Required, prices: Prices | None = None, *, speed: Mapping[str
 
 
 def _price(known: Mapping[str, float], name: str) -> float:
-    name = name.removeprefix("estimated error: ")
+    name = name.removeprefix(ESTIMATE)
     if name in known or not name.startswith("law "):
         return known.get(name, 0.0)
     return max((value for key, value in known.items() if key.startswith("law ")), default=0.0)
@@ -324,7 +340,8 @@ def matter_error(needs: Required, prices: Prices | None = None) -> float:
 
     It is of first order in dx: the error of a law on eight cells times eight over the cells of each body, root mean
     square over particles. Fronts of docs/results/TRADEOFF.md gave the numbers, those of `cfl` and `particles_per_cell`
-    as powers.
+    as powers: longer steps damp a little less. Fluids, which break down at 0.8 where they are compressed, gain nothing
+    above the standard's 0.6.
 
     Args:
         needs: of the scene.
@@ -332,9 +349,13 @@ def matter_error(needs: Required, prices: Prices | None = None) -> float:
     """
     known = (prices or shipped_prices()).error
     worst = max(known.values(), default=0.0)
-    square = sum(b.particles * (known.get(b.law, worst) * 8 / max(b.cells, 1e-9)) ** 2 for b in needs.bodies)
-    error = math.sqrt(square / max(needs.particles, 1))
-    error *= (needs.cfl / 0.4) ** -0.2 * (needs.particles_per_cell / 8) ** -0.1
+
+    def of(body: Body) -> float:
+        cfl = min(needs.cfl, _FLUID_CFL) if body.law == "fluid" else needs.cfl
+        return known.get(body.law, worst) * 8 / max(body.cells, 1e-9) * (cfl / 0.4) ** -0.2
+
+    square = sum(body.particles * of(body) ** 2 for body in needs.bodies)
+    error = math.sqrt(square / max(needs.particles, 1)) * (needs.particles_per_cell / 8) ** -0.1
     return error * (1.35 if needs.kernel == "cubic" else 1.0)
 
 
@@ -347,45 +368,6 @@ def picture_error(needs: Required) -> float:
     faint = 1.3e-3 * needs.alpha_min / _ALPHA
     smaller = 0.0134 * max(1 / needs.scale - 1, 0)
     return math.hypot(faint, smaller, 0.015 * needs.fewer_bands)
-
-
-@dataclass
-class Comparison:
-    """Predicted time beside the time that was spent."""
-
-    predicted: Prediction
-    spent: dict[str, float]  # [s] by stage, without compilation
-    compiled: dict[str, float]  # [s] by stage
-
-    def line(self) -> str:
-        """In one line."""
-        spent, compiled = math.fsum(self.spent.values()), math.fsum(self.compiled.values())
-        return (
-            f"predicted {duration(self.predicted.run_seconds)} and {duration(self.predicted.compile_seconds)} to"
-            f" compile; took {duration(spent)} and {duration(compiled)}"
-        )
-
-
-@dataclass
-class Pace:
-    """A simulation's time beside its prediction, while it goes on."""
-
-    predicted: Prediction
-    frames: int
-    apart: bool  # whether drawing begins after the simulation
-    begun: float = field(default_factory=time.perf_counter)
-
-    def line(self, frame: int) -> str | None:
-        """At the end of each quarter of the frames, the time so far and that of the prediction; else None."""
-        share = frame / self.frames
-        if math.floor(4 * share) == math.floor(4 * (frame - 1) / self.frames) or frame == self.frames:
-            return None
-        stages = ("simulate",) if self.apart else ("simulate", "draw")
-        own = [part for part in self.predicted.parts if "estimated error" not in part.name]  # that run comes later
-        compiled = (p.seconds for p in own if p.stage == "compile" and p.name.partition(":")[0] in stages)
-        expected = math.fsum(compiled) + share * math.fsum(p.seconds for p in own if p.stage in stages)
-        spent = time.perf_counter() - self.begun
-        return f"frame {frame} of {self.frames}: {duration(spent)} since the first, {duration(expected)} predicted"
 
 
 def duration(seconds: float | int) -> str:

@@ -10,19 +10,26 @@ import numpy as np
 from jaxtyping import Float
 
 from pigjax.mpm import Health, Particles
+from pigjax.mpm.materials import MaterialTable
+from pigjax.mpm.materials.energy import elastic_energy
+from pigjax.scene.plan import Plan
 
 Record: TypeAlias = dict[str, np.ndarray]  # numbers of one frame, by name
 MARK = "health_"  # prefix of a record's names in a state file
 _GAIN = 0.05  # energy that appears from nowhere, relative to the largest kinetic energy, beyond what steps round off
 _MATTER, _WORDS = ("volume_ratio", "stretch"), ("least", "mean", "most")
+_ENERGIES = ("kinetic", "gravity", "elastic")
 _MOST = ("escaped", "inverted", "wall_hits")  # counts that may fall again: the most at one time
 
 
-def health_record(particles: Particles, health: Health | None, gravity: Float[np.ndarray, "3"]) -> Record:
+def health_record(
+    particles: Particles, health: Health | None, gravity: Float[np.ndarray, "3"], table: MaterialTable
+) -> Record:
     """Health of a frame, None at the start, and the energy, momentum and deformation after it.
 
-    Energies are the kinetic one and that of gravity from the world's origin; elastic energy is not among them. Stretch
-    is the root mean square over directions, √(‖F‖² / 3), of the total deformation F, and the volume's ratio is det F.
+    Energies are the kinetic one of the particles' velocities, that of gravity from the world's origin, and the elastic
+    one (`elastic_energy`). Stretch is the root mean square over directions, √(‖F‖² / 3), of the total deformation F,
+    and the volume's ratio is det F.
     """
     numbers = () if health is None else fields(Health)
     record = {field.name: np.asarray(getattr(health, field.name)) for field in numbers if field.name != "sides_met"}
@@ -33,6 +40,11 @@ def health_record(particles: Particles, health: Health | None, gravity: Float[np
     return record | {
         "kinetic_energy": np.asarray((mass * (v**2).sum(1)).sum() / 2),
         "gravity_energy": np.asarray((mass * height).sum()),
+        "elastic_energy": np.asarray(
+            elastic_energy(
+                table, *map(np.asarray, (particles.material, particles.F, particles.hardening, particles.volume0))
+            )
+        ),
         "momentum": (mass[:, None] * v).sum(0),
         "mass": mass.sum(),
         **_deformation(np.asarray(particles.F_visual)),
@@ -59,7 +71,7 @@ def summary(records: Mapping[int, Record]) -> dict[str, Any]:
     if not rows:
         return {}
     bad = [frame for frame in sorted(records) if frame > 0 and records[frame]["first_bad_frame"] >= 0]
-    energy = {name: [float(row[f"{name}_energy"]) for row in everything] for name in ("kinetic", "gravity")}
+    energy = {name: _series(everything, f"{name}_energy") for name in _ENERGIES}
     return {
         "frames": len(rows),
         "min_J": float(min(row["min_J"] for row in rows)),
@@ -70,9 +82,46 @@ def summary(records: Mapping[int, Record]) -> dict[str, Any]:
         "first_bad_frame": bad[0] if bad else None,
         "kinetic_energy_J": energy["kinetic"],
         "gravity_energy_J": energy["gravity"],
+        "elastic_energy_J": energy["elastic"],
         "momentum_kg_m_s": [row["momentum"].tolist() for row in everything],
         "mass_kg": [float(row.get("mass", np.nan)) for row in everything],
         **{name: {word: _series(everything, f"{name}_{word}") for word in _WORDS} for name in _MATTER},
+    }
+
+
+def drift(records: Mapping[int, Record], plan: Plan) -> dict[str, Any]:
+    """How far energy, momentum and mass are at the end from where they began; empty without a frame.
+
+    Energy is the sum of the kinetic one, that of gravity and the elastic one, and its share is one of the largest
+    kinetic energy; friction, plastic flow, viscosity, impacts and the transfers take from it. Of momentum the impulse
+    of gravity on matter that was let go is taken away, and its share is one of √(2 m E) with the mass and the largest
+    kinetic energy: where nothing else acts on the matter ("alone"), both shares but for losses of energy are errors of
+    the method. Mass is that of particles with finite places.
+
+    Args:
+        records: of frames, by number; the first and the last one count.
+        plan: of the scene.
+    """
+    if not (last := max(records, default=0)) or 0 not in records:
+        return {}
+    first, end = records[0], records[last]
+    energy = sum(
+        float(end.get(f"{name}_energy", np.nan)) - float(first.get(f"{name}_energy", np.nan)) for name in _ENERGIES
+    )
+    most = max(float(row["kinetic_energy"]) for row in records.values())
+    mass = np.bincount(np.asarray(plan.particles.material), np.asarray(plan.particles.mass), len(plan.starts))
+    seconds = plan.frame_dt * np.maximum(last - np.asarray(plan.starts), 0)  # in which each object falls
+    impulse = np.asarray(plan.gravity, np.float64) * float((mass * seconds).sum())
+    momentum = end["momentum"] - first["momentum"] - impulse
+    lost = float(end["mass"]) - float(first["mass"])
+    return {
+        "energy_J": energy,
+        "energy_share": energy / most if most > 0 else 0.0,
+        "momentum_kg_m_s": momentum.tolist(),
+        "momentum_share": float(np.linalg.norm(momentum)) / (2 * float(mass.sum()) * most) ** 0.5 if most > 0 else 0.0,
+        "mass_kg": lost,
+        "mass_share": lost / float(first["mass"]),
+        "alone": not (plan.colliders or plan.forces or plan.pins or any(plan.starts)),
     }
 
 

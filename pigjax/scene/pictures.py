@@ -22,6 +22,7 @@ from pigjax.coupling.binding import carried_gaussians, deform
 from pigjax.mpm import Particles
 from pigjax.objects.overlay import legend_sheet, overlay
 from pigjax.scene.own import Surfaces
+from pigjax.scene.pace import Progress
 from pigjax.scene.plan import Inputs, Plan, make_cameras, render_config
 from pigjax.scene.report import RunReport
 from pigjax.scene.schema import Scene
@@ -31,7 +32,6 @@ from pigjax.splatting.shadows import Light, cast_shadows, light_transmittance
 
 SHEET_FRAMES = 12
 _UNSEEN = -40.0  # logit of an opacity that is never drawn
-Progress = Callable[[str, int, int], None]  # stage, done, of
 
 
 def shaded_picture(

@@ -195,10 +195,9 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
         if entry.within is not None
     }
     asked = {name: k for name, k in inputs.ids.items() if name not in regions and name not in inputs.own}
-    masked = inputs.views is not None and inputs.views.masks is not None
     if inputs.stored is not None:
         labels = _stored(scene, inputs, asked)
-    elif masked:
+    elif masks_vote(inputs):
         labels = _lifted(scene, inputs, asked)
     else:
         labels = _one_object(inputs, next(iter(asked.values()), 0))
@@ -210,10 +209,15 @@ def segment(scene: Scene, inputs: Inputs) -> Labels:
     for name, number in inputs.ids.items():
         if name not in inputs.own and not np.any(np.asarray(labels.object_id) == number):
             raise SceneError(f"objects.{name}: other objects took all its Gaussians; check objects.<name>.within.")
-    if inputs.stored is not None or masked:
+    if inputs.stored is not None or masks_vote(inputs):
         found = np.unique(np.maximum(labels.object_id, 0))
         _warn_of_unnamed(inputs, found[found > 0])
     return labels
+
+
+def masks_vote(inputs: Inputs) -> bool:
+    """Whether a scene's objects come from a vote of the masks: in `segment`, or before where the scale needed them."""
+    return inputs.stored is None and inputs.views is not None and inputs.views.masks is not None
 
 
 def _one_object(inputs: Inputs, number: int) -> Labels:

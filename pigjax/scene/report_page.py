@@ -62,10 +62,9 @@ def report_page(
         parts.append("<h2>Warnings</h2>")
         parts += [f'<p class="note">{escape(text)}</p>' for text in report.warnings]
     parts += ["<h2>Modelled</h2>", _table(_modelled(scene, report))]
-    without = [*left_out(scene, report), "Elastic energy in the curves below."]
-    parts += ["<h2>Left out</h2>", "<ul>", *(f"<li>{escape(text)}</li>" for text in without), "</ul>"]
+    parts += ["<h2>Left out</h2>", "<ul>", *(f"<li>{escape(text)}</li>" for text in left_out(scene, report)), "</ul>"]
     parts += ["<h2>Objects</h2>", _objects(scene, report), "<h2>Times</h2>", _times(report)]
-    parts += ["<h2>Health</h2>", _estimated(report), _health(report), _charts(scene, report)]
+    parts += ["<h2>Health</h2>", _estimated(report), _health(report), _drift(report), _charts(scene, report)]
     parts += ["<h2>Settings</h2>", "<p>Save as a scene file beside this page to reproduce the run.</p>"]
     parts += [f"<pre>{escape(settings)}</pre>", "<h2>Versions</h2>", _table(_versions())]
     return (
@@ -170,14 +169,48 @@ def _health(report: RunReport) -> str:
     return _table({name.replace("_", " "): v for name, v in report.health.items() if not isinstance(v, list | dict)})
 
 
+def _drift(report: RunReport) -> str:
+    """Change of energy, momentum and mass from the start to the end, and its causes."""
+    found = report.health.get("drift")
+    if not found:
+        return ""
+    momentum = ", ".join(f"{value:.2g}" for value in found["momentum_kg_m_s"])
+    alone = found["alone"]
+    rows = (
+        (
+            "energy",
+            f"{found['energy_J']:.2g} J",
+            f"{100 * found['energy_share']:.2g} % of the largest kinetic energy",
+            "kinetic, of gravity and elastic together; losses by plastic flow, viscosity, "
+            + ("" if alone else "friction, impacts, ")
+            + "and the transfers between particles and grid",
+        ),
+        (
+            "momentum",
+            f"{momentum} kg m/s",
+            f"{100 * found['momentum_share']:.2g} % of that of all matter at the largest kinetic energy",
+            "beside gravity's impulse; "
+            + ("nothing else acts on the matter" if alone else "by colliders, pins, forces and matter that is held"),
+        ),
+        ("mass", f"{found['mass_kg']:.2g} kg", f"{100 * found['mass_share']:.2g} %", "of particles that broke down"),
+    )
+    left = (
+        "Not in the energy: motion within a particle, the energy that hardening stores, and torn matter under pressure."
+    )
+    return _rows(("drift", "end less start", "share", "of what"), rows) + f"<p>{left}</p>"
+
+
 def _charts(scene: Scene, report: RunReport) -> str:
     health = report.health
     step = 1 / (scene.simulation.fps * scene.simulation.slow_motion)
     charts = []
-    kinetic, gravity = (np.asarray(health.get(f"{name}_energy_J", []), float) for name in ("kinetic", "gravity"))
+    kinetic, gravity, elastic = (
+        np.asarray(health.get(f"{name}_energy_J", []), float) for name in ("kinetic", "gravity", "elastic")
+    )
     if len(kinetic):
         height = gravity - gravity[0]
-        charts.append(("Energy", "J", {"kinetic": kinetic, "of gravity": height, "sum": kinetic + height}))
+        energies = {"kinetic": kinetic, "of gravity": height, "elastic": elastic, "sum": kinetic + height + elastic}
+        charts.append(("Energy", "J", energies))
     momentum = np.asarray(health.get("momentum_kg_m_s", []), float)
     if len(momentum):
         charts.append(("Momentum", "kg m/s", dict(zip("xyz", momentum.T))))

@@ -10,10 +10,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from msgspec import structs
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from pigjax import io
+from pigjax.core.camera import Camera
 from pigjax.core.errors import SceneError
 from pigjax.coupling.filling import lattice_step
 from pigjax.coupling.outliers import cut_outliers
@@ -26,8 +28,10 @@ from pigjax.scene.advice import default_dx
 from pigjax.scene.arrangement import arrange
 from pigjax.scene.costs import Body, Required
 from pigjax.scene.forces import forces_of
-from pigjax.scene.plan import Inputs, Plan, gravity_of, read_inputs, segment
-from pigjax.scene.schema import Scene
+from pigjax.scene.own import GRAINS, chosen, is_grainy
+from pigjax.scene.plan import Inputs, Plan, gravity_of, make_cameras, masks_vote, read_inputs, segment
+from pigjax.scene.reach import Extent, Ground, Mover, Obstacle, extent_of, windows
+from pigjax.scene.schema import Scene, VolumeSpec
 from pigjax.segmentation import Labels
 
 _VIEWS = 8  # photos whose masks are looked up
@@ -37,7 +41,9 @@ _VOXELS = 32  # along the longest side of an object
 _SAMPLE = 5_000  # Gaussians whose nearest neighbour is looked for
 _GAPS = 1.8  # distances to the third neighbour in a voxel: smaller ones leave holes in shells
 _SIDES = 5  # of the six sides, from which an inner voxel is hidden: what stands on a table is open below
-_ROOM, _AROUND, _UNIT = 1.3, 7, 4  # of the active grid, see `ActiveGrid`
+_OWN = 4.0  # splats of its own for each particle of a captured object: 3.5 to 4.5 of docs/results/OWN_SPLATS.md
+_TILE = 16  # pixels a side
+_MOST_OF = (0.005, 0.995)  # of the Gaussians of an object along each axis: floaters do not count
 
 
 class Shape(NamedTuple):
@@ -72,7 +78,8 @@ class Survey:
     inputs: Inputs
     labels: Labels
     shapes: dict[str, Shape]  # of the objects that move
-    voted: bool  # whether the run lets masks vote
+    redrawn: float  # share of the picture that each frame draws anew
+    extent: Extent  # bounds that the objects that move are expected to have
 
 
 def survey(scene: Scene) -> Survey:
@@ -89,16 +96,18 @@ def survey(scene: Scene) -> Survey:
         InputError: as `read_inputs` and `segment`.
     """
     inputs = read_inputs(scene)
-    asked = [name for name, e in scene.objects.items() if e.gaussians is None and e.within is None]
-    voted = inputs.stored is None and inputs.views is not None and inputs.labels is None and bool(asked)
-    labels = _quick_labels(scene, inputs) if voted else segment(scene, inputs)
+    known = inputs.labels is not None or not masks_vote(inputs)
+    labels = segment(scene, inputs) if known else _quick_labels(scene, inputs)
     scene, inputs, labels = arrange(scene, inputs, labels)
     labels, _ = cut_outliers(
         inputs.gaussians, labels, {inputs.ids[name]: entry.keep for name, entry in scene.objects.items()}
     )
     object_id, means = np.asarray(labels.object_id), np.asarray(inputs.gaussians.means, np.float64)
     shapes = {name: shape_of(means[object_id == inputs.ids[name]]) for name, e in scene.objects.items() if not e.fixed}
-    return Survey(scene, inputs, labels, shapes, voted)
+    laws = {name: scene.objects[name].to_material(name).model for name in shapes}
+    boxes = [(shape.means.min(0), shape.means.max(0)) for shape in shapes.values()]
+    extent = _extent(scene, inputs, object_id, laws, boxes)
+    return Survey(scene, inputs, labels, shapes, redrawn(scene, inputs, means, object_id), extent)
 
 
 def _quick_labels(scene: Scene, inputs: Inputs) -> Labels:
@@ -121,19 +130,26 @@ def _ids_of_centres(inputs: Inputs) -> Int[np.ndarray, "n"]:
     ids = np.full((len(means), min(_VIEWS, len(masks))), -1, np.int64)
     for column, view in enumerate(np.linspace(0, len(masks) - 1, ids.shape[1]).round().astype(int)):
         camera, mask = cameras[int(view)], np.asarray(masks[view])
-        matrix = np.asarray(camera.world_to_cam, np.float64)
-        local = np.einsum("ij,nj->ni", matrix[:3, :3], means) + matrix[:3, 3]
-        depth = np.maximum(local[:, 2], 1e-9)
-        focal, centre = np.asarray(camera.focal, np.float64), np.asarray(camera.centre, np.float64)
-        pixel = np.floor(np.clip(local[:, :2] / depth[:, None] * focal + centre, -1, 1e6)).astype(int)
         height, width = mask.shape
-        seen = (local[:, 2] > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
+        pixel, depth, seen = _seen_by(camera, means, (height, width))
         cell = (pixel[:, 1] // _COARSE) * (width // _COARSE + 1) + pixel[:, 0] // _COARSE
         nearest = np.full((height // _COARSE + 1) * (width // _COARSE + 1), np.inf)
         np.minimum.at(nearest, cell[seen], depth[seen])
         seen[seen] = depth[seen] <= _BEHIND * nearest[cell[seen]]
         ids[seen, column] = mask[pixel[seen, 1], pixel[seen, 0]]
     return _most_named(ids, means)
+
+
+def _seen_by(
+    camera: Camera, means: Float[np.ndarray, "n 3"], size: tuple[int, int]
+) -> tuple[Int[np.ndarray, "n 2"], Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """Pixel of each place in a picture of (height, width), its depth [m], and whether it is in front and inside."""
+    matrix = np.asarray(camera.world_to_cam, np.float64)
+    local = np.einsum("ij,nj->ni", matrix[:3, :3], means) + matrix[:3, 3]
+    depth = np.maximum(local[:, 2], 1e-9)
+    focal, centre = np.asarray(camera.focal, np.float64), np.asarray(camera.centre, np.float64)
+    pixel = np.floor(np.clip(local[:, :2] / depth[:, None] * focal + centre, -1, 1e6)).astype(int)
+    return pixel, depth, (local[:, 2] > 0) & (pixel >= 0).all(1) & (pixel < size[::-1]).all(1)
 
 
 def _most_named(ids: Int[np.ndarray, "n v"], means: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
@@ -181,7 +197,7 @@ def required_by(survey: Survey, scene: Scene | None = None) -> Required:
 
     Args:
         survey: of `survey`.
-        scene: the surveyed scene with other settings of `simulation`, `drawing` or `output`; by default its own.
+        scene: the surveyed scene with another grid, step, drawing or output, and as many frames; by default its own.
 
     Raises:
         InputError: no step is stable.
@@ -219,8 +235,8 @@ def required_by(survey: Survey, scene: Scene | None = None) -> Required:
         forces=_forces(scene, particles, list(moving)),
     )
     return _required(
-        scene, inputs, survey.labels, bodies, values[:, :3], dx,
-        substeps=rule.first, integrator=rule.config.integrator, voted=survey.voted, guessed=True,
+        scene, inputs, survey.labels, bodies, survey.extent, dx, redrawn=survey.redrawn,
+        substeps=rule.first, integrator=rule.config.integrator, guessed=True,
     )  # fmt: skip
 
 
@@ -248,7 +264,7 @@ def _forces(scene: Scene, particles: Particles, names: list[str]) -> tuple[Force
         return ()
 
 
-def counted(scene: Scene, inputs: Inputs, plan: Plan, *, substeps: int, integrator: str, voted: bool) -> Required:
+def counted(scene: Scene, inputs: Inputs, plan: Plan, *, substeps: int, integrator: str) -> Required:
     """What a scene requires, counted from its particles.
 
     Args:
@@ -257,7 +273,6 @@ def counted(scene: Scene, inputs: Inputs, plan: Plan, *, substeps: int, integrat
         plan: of the scene.
         substeps: of the first frame.
         integrator: that was chosen.
-        voted: whether masks voted.
     """
     rows, volumes = np.asarray(plan.particles.material), np.asarray(plan.particles.volume0, np.float64)
     names = [name for name, entry in scene.objects.items() if not entry.fixed]
@@ -266,10 +281,35 @@ def counted(scene: Scene, inputs: Inputs, plan: Plan, *, substeps: int, integrat
         Body(name, law, int(n), float(side) / plan.dx)
         for name, law, n, side in zip(names, plan.table.laws, plan.particles.counts, size)
     ]
+    x = np.asarray(plan.particles.x, np.float64)
+    boxes = [(x[rows == row].min(0), x[rows == row].max(0)) for row in range(len(names))]
+    means, object_id = np.asarray(inputs.gaussians.means, np.float64), np.asarray(plan.labels.object_id)
+    extent = _extent(scene, inputs, object_id, dict(zip(names, plan.table.laws)), boxes)
     return _required(
-        scene, inputs, plan.labels, bodies, np.asarray(plan.particles.x, np.float64), plan.dx,
-        substeps=substeps, integrator=integrator, voted=voted, guessed=False,
+        scene, inputs, plan.labels, bodies, extent, plan.dx, redrawn=redrawn(scene, inputs, means, object_id),
+        substeps=substeps, integrator=integrator, guessed=False,
     )  # fmt: skip
+
+
+def redrawn(scene: Scene, inputs: Inputs, means: Float[np.ndarray, "n 3"], object_id: Int[np.ndarray, "n"]) -> float:
+    """Share of the picture's tiles that moving matter touches at rest; 1 where the camera or a light moves it all.
+
+    Args:
+        scene: its objects, camera and light.
+        inputs: its files.
+        means: of the Gaussians [m].
+        object_id: of each Gaussian.
+    """
+    mine = means[np.isin(object_id, [inputs.ids[name] for name, entry in scene.objects.items() if not entry.fixed])]
+    if scene.light is not None or scene.camera.sweep or not len(mine):
+        return 1.0
+    first = structs.replace(scene, simulation=structs.replace(scene.simulation, frames=1))
+    camera = make_cameras(first, inputs, mine.mean(0), mine)[0]
+    pixel, _, seen = _seen_by(camera, mine, (camera.height, camera.width))
+    tiles = np.zeros((-(-camera.height // _TILE), -(-camera.width // _TILE)), bool)
+    column, row = (pixel[seen] // _TILE).T
+    tiles[row, column] = True
+    return float(ndimage.binary_dilation(tiles, np.ones((3, 3), bool)).mean())  # splats reach into the next tile
 
 
 def _required(
@@ -277,20 +317,25 @@ def _required(
     inputs: Inputs,
     labels: Labels,
     bodies: Iterable[Body],
-    x: Float[np.ndarray, "p 3"],
+    extent: Extent,
     dx: float,
     *,
+    redrawn: float,
     substeps: int,
     integrator: str,
-    voted: bool,
     guessed: bool,
 ) -> Required:
     spec, drawing, views = scene.simulation, scene.drawing, inputs.views
     bodies = tuple(bodies)
     object_id = np.asarray(labels.object_id)
-    of_kind = {fixed: _members(object_id, inputs.ids, scene, fixed=fixed) for fixed in (False, True)}
-    sides = np.ceil((x.max(0) - x.min(0)) / dx) + _AROUND
-    nodes = math.prod(int(-(-side * _ROOM // _UNIT)) * _UNIT for side in sides)
+
+    def gaussians_of(names: Iterable[str]) -> int:
+        return int(np.isin(object_id, [inputs.ids[name] for name in names]).sum())
+
+    kept = set(inputs.reused)  # nothing of it is made again
+    still = [name for name, entry in scene.objects.items() if entry.fixed]
+    grid = windows(extent, dx)
+    own = _own(scene, bodies)
     total = inputs.gaussians.sh.shape[1]
     drawn = total if drawing.sh_degree is None else min((drawing.sh_degree + 1) ** 2, total)
     every, frames = scene.output.states_every, spec.frames
@@ -299,20 +344,27 @@ def _required(
     return Required(
         bodies=bodies,
         dx=dx,
-        nodes=nodes,
+        nodes=round(grid.mean),
+        most_nodes=grid.most,
+        windows=grid.programs,
+        redrawn=redrawn,
         frames=frames,
         substeps=substeps,
         gaussians=len(inputs.gaussians),
-        moving=int(of_kind[False].sum()),
-        still=int(of_kind[True].sum()),
-        still_objects=sum(entry.fixed for entry in scene.objects.values()),
+        moving=gaussians_of(name for name in scene.objects if name not in still),
+        still=gaussians_of(name for name in still if f"solid of {name}" not in kept),
+        still_objects=len(still),
         sh_coefficients=drawn,
+        **own,
+        light=0 if scene.light is None else scene.light.to_light().samples,
         colliders=len(scene.colliders()),
         pixels=_pixels(scene),
         photos=photos,
         photo_pixels=pixels,
-        voted=voted,
-        filled=int(np.isin(object_id, [inputs.ids[name] for name, entry in scene.objects.items() if entry.fill]).sum()),
+        voted=masks_vote(inputs) and "votes" not in kept,
+        filled=gaussians_of(
+            name for name, entry in scene.objects.items() if entry.fill and f"surface of {name}" not in kept
+        ),
         contact=spec.contact_friction is not None and len(bodies) > 1,
         forces=len(scene.forces),
         integrator=integrator,
@@ -329,8 +381,45 @@ def _required(
     )
 
 
-def _members(
-    object_id: Int[np.ndarray, "n"], ids: Mapping[str, int], scene: Scene, *, fixed: bool
-) -> Bool[np.ndarray, "n"]:
-    numbers = [ids[name] for name, entry in scene.objects.items() if entry.fixed == fixed]
-    return np.isin(object_id, numbers)
+def _extent(
+    scene: Scene,
+    inputs: Inputs,
+    object_id: Int[np.ndarray, "n"],
+    laws: Mapping[str, str],
+    boxes: Iterable[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]],
+) -> Extent:
+    """Bounds that the moving objects, of some laws and in some boxes at first, are expected to have."""
+    spec, movers, obstacles = scene.simulation, [], []
+    for (name, law), (low, high) in zip(laws.items(), boxes):
+        entry = scene.objects[name]
+        held = isinstance(entry, VolumeSpec) and entry.fills is not None
+        movers.append(Mover(low, high, np.array(entry.velocity), law, entry.start, held))
+    means = np.asarray(inputs.gaussians.means, np.float64)
+    for name, entry in scene.objects.items():
+        own = means[object_id == inputs.ids[name]]
+        if entry.fixed and len(own):
+            low, high = np.quantile(own, _MOST_OF, axis=0)
+            obstacles.append(Obstacle(low, high, entry.friction, entry.hollow))
+    grounds = [
+        Ground(np.array(plane.point), np.array(plane.normal) / np.linalg.norm(plane.normal), plane.friction)
+        for plane in scene.planes.values()
+    ]
+    frame_dt = 1 / (spec.fps * spec.slow_motion)
+    return extent_of(movers, obstacles, grounds, gravity_of(scene), frames=spec.frames, frame_dt=frame_dt)
+
+
+def _own(scene: Scene, bodies: Iterable[Body]) -> dict[str, int]:
+    """Numbers of splats of their own and of what is done for them, as far as laws decide which objects get them."""
+    laws, particles = ({body.name: getattr(body, name) for body in bodies} for name in ("law", "particles"))
+    own = refitted = refits = smooth = 0
+    for name in chosen(scene, laws, lambda name: False):
+        entry, count = scene.objects[name], particles[name]
+        poured = isinstance(entry, VolumeSpec)
+        smooth += count * (entry.surface == "smooth" and laws[name] == "fluid")
+        if poured:  # one splat a particle is among the scene's Gaussians
+            own += (GRAINS - 1) * count * is_grainy(entry, laws[name])
+            continue
+        own += round(_OWN * count)
+        refitted += round(_OWN * count) * entry.refit
+        refits += entry.refit
+    return {"own": own, "refitted": refitted, "refits": refits, "smooth": smooth}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -20,11 +20,11 @@ from pigjax.mpm.simulate import SimulatedFrame
 from pigjax.mpm.sleep import Sleeper
 from pigjax.scene.advice import plan_line
 from pigjax.scene.arrangement import arrange
-from pigjax.scene.budget import ScenePlan, refined
-from pigjax.scene.costs import Comparison, Pace, Prediction, predict
-from pigjax.scene.health import MARK, Record, health_record, remarks, summary
+from pigjax.scene.budget import ScenePlan
+from pigjax.scene.health import MARK, Record, drift, health_record, remarks, summary
 from pigjax.scene.own import MADE, chosen, is_torn, laws_of, surfaces_of, waits_for_motion, with_own
-from pigjax.scene.pictures import SHEET_FRAMES, Pictures, Progress, draw_run
+from pigjax.scene.pace import Pace, Progress, Say
+from pigjax.scene.pictures import SHEET_FRAMES, Pictures, draw_run
 from pigjax.scene.plan import Inputs, Plan, make_plan, provenance, read_inputs, segment
 from pigjax.scene.replay import COLLIDER_FILE, REST_FILE, SCENE_FILE, rows_of, store_colliders, store_rest
 from pigjax.scene.report import RunReport
@@ -40,7 +40,6 @@ _FILES = (
     "video.mp4", "contact_sheet.png", "objects.png", "labels.npz", COLLIDER_FILE, REST_FILE, SCENE_FILE, "report.json",
     "report.html",
 )  # fmt: skip
-Say = Callable[[str], None]  # a line to read before the long work
 
 
 @checked
@@ -69,7 +68,8 @@ def run_scene(
             a line each; they are in the report, too.
         overwrite: replace states in `out_dir` that were made from something else, instead of refusing them.
         planned: of `plan_scene`; `scene` is usually its `scene`. The run then tells the time of this machine, and
-            compares it with the time spent, at each quarter of the simulation and at the end.
+            compares it with the time spent, at the end of each stage and at each quarter of the frames, and warns where
+            the budget will be broken.
 
     Raises:
         StaleError: the states in `out_dir` were made from other settings or files; it names what changed.
@@ -78,11 +78,11 @@ def run_scene(
     """
     out = io.output_folder(out_dir, files=_FILES, folders=("states",))
     report = RunReport()
-    tell = progress or (lambda stage, done, of: None)
+    tell = Pace(progress, say, planned)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            _run(scene, out, report, tell, say or (lambda line: None), overwrite, planned)
+            _run(scene, out, report, tell, say or (lambda line: None), overwrite)
         except StaleError:
             raise  # report.json still tells of the results that are there
         except BaseException as error:
@@ -105,10 +105,9 @@ def _run(
     scene: Scene,
     out: Path,
     report: RunReport,
-    tell: Progress,
+    tell: Pace,
     say: Say,
     overwrite: bool,
-    planned: ScenePlan | None,
 ) -> None:
     with report.stage("read"):
         inputs = read_inputs(scene)
@@ -135,9 +134,8 @@ def _run(
         say(f"note: {remark}")
     report.warnings += plan.remarks
     stages = stages_of(plan, scene.simulation.frames)
-    prediction = _predict(scene, inputs, plan, stages, report, planned)
+    _predict(scene, inputs, plan, stages, report, tell)
     say(report.plan)
-    told = say if planned is not None else None
     seen, shown, surfaces, laws = inputs, plan, None, laws_of(scene, plan)
     own_wanted = any(entry.splats != "carried" for entry in scene.objects.values())
 
@@ -161,7 +159,7 @@ def _run(
         if own_wanted:
             make_own()
         pictures = Pictures.of(scene, seen, shown)
-    states = _simulate(scene, plan, stages, out / "states", parts, key, report, tell, told, prediction)
+    states = _simulate(scene, plan, stages, out / "states", parts, key, report, tell)
     followed = None
     if frames := min(scene.output.error_frames, scene.simulation.frames):
         followed = Followed(np.asarray(plan.particles.gaussian), frames, out / "states", key)
@@ -186,33 +184,16 @@ def _run(
             report.warnings.append(
                 "output.error_frames: nothing moved, or no state was there, so that no error is estimated."
             )
-    _compare(report, prediction, told)
+    tell.end(report)
 
 
-def _predict(
-    scene: Scene, inputs: Inputs, plan: Plan, stages: list[Stage], report: RunReport, planned: ScenePlan | None
-) -> Prediction:
+def _predict(scene: Scene, inputs: Inputs, plan: Plan, stages: list[Stage], report: RunReport, pace: Pace) -> None:
     """What the run requires and will cost, told by the report."""
     first = stages[0].rule
-    needs = counted(
-        scene, inputs, plan, substeps=first.first, integrator=first.config.integrator,
-        voted=inputs.stored is None and inputs.views is not None and "votes" not in inputs.reused,
-    )  # fmt: skip
-    prediction = predict(needs) if planned is None else refined(planned, needs)
+    needs = counted(scene, inputs, plan, substeps=first.first, integrator=first.config.integrator)
+    prediction = pace.counted(needs)
     report.plan = plan_line(needs, prediction)
     report.predicted |= prediction.as_dict() | {"required": {**asdict(needs), "bodies": list(map(list, needs.bodies))}}
-    return prediction
-
-
-def _compare(report: RunReport, prediction: Prediction, say: Say | None) -> None:
-    """The time spent beside the prediction; a run that went on from saved states did only a part."""
-    spent = Comparison(
-        prediction,
-        {name: t.run for name, t in report.times.items()},
-        {name: t.compile for name, t in report.times.items()},
-    )
-    if say is not None and not report.sizes.get("resumed_from_frame"):
-        say(spent.line())
 
 
 def _store(
@@ -311,8 +292,6 @@ def _simulate(
     key: str,
     report: RunReport,
     tell: Progress,
-    say: Say | None,
-    prediction: Prediction,
 ) -> Iterator[int]:
     """Simulate the frames that are not on disk yet, from the last checkpoint on; yields the last one that is there.
 
@@ -329,7 +308,7 @@ def _simulate(
     missing = set(range(last + 1)) - present  # of a run without a checkpoint all frames from the first are made again
     repaired = 0 if saved is None else max(missing, default=0)
     # of all frames, as their states may not stay on disk
-    records = {0: health_record(particles, None, plan.gravity)} | _records(folder, present, key)
+    records = {0: health_record(particles, None, plan.gravity, plan.table)} | _records(folder, present, key)
     half = scene.output.compress_states
     if saved is None or 0 in missing:
         _save(folder, 0, particles, records[0], key, half=half)
@@ -350,10 +329,9 @@ def _simulate(
             yield from run(resumed, frames=range(last, frames))
 
     tell("simulate", 0 if repaired else last, frames)
-    pace = Pace(prediction, frames, scene.output.states_every == 1)
     yield 0 if repaired else last
     for frame, after, _, health in todo():
-        records[frame] = record = health_record(after, health, plan.gravity)
+        records[frame] = record = health_record(after, health, plan.gravity, plan.table)
         if health.is_broken():
             report.health |= summary({number: known for number, known in records.items() if number <= frame})
             raise SimulationError(
@@ -366,13 +344,11 @@ def _simulate(
             _checkpoint(checkpoint, frame, after, active, parts)
         if frame < frames:
             tell("simulate", frame, frames)
-        if say is not None and saved is None and (line := pace.line(frame)):
-            say(line)
         yield frame
     tell("simulate", frames, frames)
     most = max((int(record["substeps"]) for frame, record in records.items() if frame), default=stages[0].rule.first)
     report.sizes |= {"substeps_per_frame": most, "last_grid": active.shape, "resumed_from_frame": last}
-    report.health |= summary(records)
+    report.health |= summary(records) | {"drift": drift(records, plan)}
     driven = bool(plan.forces) or any(collider.moves for collider in plan.colliders)
     report.warnings += remarks(report.health, driven=driven)
     if isinstance(active, Sleeper):

@@ -99,7 +99,8 @@ class SimulationSpec(Section, frozen=True):
     # matter that fills a cell of the grid: 2 along each axis, with which no gaps open as it stretches a little
     particles_per_cell: Annotated[float, Limits(0, 1e4, above=True)] = 8.0
     fill: bool = True  # fill objects with particles inside, where a capture is hollow
-    # cells that waves and matter cross in a step; the error hardly depends on it, and fluids break down above 0.8
+    # cells that waves and matter cross in a step; the error hardly depends on it, a compressed fluid breaks down at 0.8
+    # and other matter at 0.9 or more
     cfl: Annotated[float, Limits(0, 1, above=True)] = 0.6
     # B-spline between particles and grid: "quadratic" has 27 nodes for each particle, "cubic" 64 and is smoother
     kernel: Literal["quadratic", "cubic"] = "quadratic"

@@ -42,6 +42,15 @@ def test_an_entry_replaces_that_of_its_commit_and_the_oldest_give_way(monkeypatc
     assert guard.last_of(entries, "z") is None
 
 
+def test_the_history_has_a_column_for_each_commit_and_tells_steps():
+    entries = [{"commit": c, "timings": {"a": t}} for c, t in (("1", 1.0), ("2", 1.05), ("3", 1.4))]
+    lines = guard.history_of(entries)
+    assert [word.strip() for word in lines[0].splitlines()[0].strip("| ").split("|")][1:] == ["1", "2", "3"]
+    (told,) = lines[2:]
+    assert told.startswith("2 to 3: warning: a: 1.4 yardsticks, 1.05 stored: +33%")
+    assert "no entry" in guard.history_of([])[0].lower()
+
+
 def test_what_is_stored_is_whole():
     for entry in json.loads(guard.FILE.read_text()):
         assert {"commit", "kind", "machine", "timings", "programs", "accuracy"} == set(entry)

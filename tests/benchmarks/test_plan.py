@@ -1,11 +1,14 @@
 """The fit of prices recovers those that made the times, and leaves alone what no run needs."""
 
 import dataclasses
+import subprocess
+import sys
 
 import pytest
 from needs import NEEDS, scaled
 
-from benchmarks.plan import CHECKED, FITTED, Measured, fitted_prices, least_squares, scene_of
+from benchmarks.common.timing import peak_memory, processor_time
+from benchmarks.plan import CHECKED, FITTED, Measured, fitted_errors, fitted_prices, least_squares, scene_of
 from pigjax.scene import costs
 
 
@@ -40,3 +43,28 @@ def test_scenes_of_the_check_were_not_fitted_on():
     assert len(CHECKED) >= 6
     fitted = {repr(scene_of(case).simulation) + case.source for case in FITTED.values()}
     assert not fitted & {repr(scene_of(case).simulation) + case.source for case in CHECKED.values()}
+
+
+def test_scenes_of_the_check_are_of_many_kinds():
+    kinds = {case.source for case in CHECKED.values()}
+    assert sum("tabletop" in scene_of(case).input.gaussians for case in CHECKED.values()) <= 2
+    assert {"gallery/cup.toml", "gallery/plant.toml", "elastic"} <= kinds
+    scenes = [scene_of(case) for case in CHECKED.values()]
+    assert any(scene.volumes for scene in scenes)
+    assert any(scene.light for scene in scenes)
+    assert any(scene.camera.sweep for scene in scenes)
+
+
+def test_errors_are_fitted_by_runs_of_one_law_that_measured_theirs():
+    before = costs.shipped_prices()
+    jelly = dataclasses.replace(NEEDS, bodies=NEEDS.bodies[:1])
+    guess = costs.matter_error(jelly, before)
+    runs = [Measured(jelly, {}, {}, 1e9, {}, 2 * guess, None), Measured(NEEDS, {}, {}, 1e9, {}, 5.0, None)]
+    assert fitted_errors(before, runs) == {"neo_hookean": pytest.approx(2 * before.error["neo_hookean"], rel=0.05)}
+
+
+def test_costs_count_the_processes_that_a_benchmark_started():
+    before = processor_time()
+    subprocess.run([sys.executable, "-c", "sum(range(3_000_000))"], check=True)
+    assert processor_time() > before + 0.03
+    assert peak_memory() > 0.005

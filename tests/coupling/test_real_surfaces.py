@@ -72,6 +72,25 @@ def test_the_lattice_is_exact_near_the_surface_and_cheap(capsys):
     assert (fast[far] > 0.02).all()
     with capsys.disabled():
         print(f"signed distance of 12,000 points on {np.prod(shape)} samples: {spent:.1f} s of processor time")
+    assert spent < 6.0  # two seconds on a quiet core, and three times that where others share its caches
+
+
+@pytest.mark.slow
+def test_the_distance_of_four_times_the_points_costs_as_n_log_n(capsys):
+    low, shape = np.full(3, -0.62), np.array([63, 62, 61])
+
+    def cost(count):
+        points, times = sphere(count, 0.5), []
+        for _ in range(3):
+            begun = time.process_time()
+            sampled_distance(points, points / 0.5, 0.03, low, 0.02, shape)
+            times.append(time.process_time() - begun)
+        return min(times)
+
+    few, many = cost(12_000), cost(48_000)
+    with capsys.disabled():
+        print(f"signed distance of 12,000 and 48,000 points: {few:.2f} and {many:.2f} s of processor time")
+    assert many < 1.5 * 4 * np.log(48_000) / np.log(12_000) * few  # half as much again for caches; n² would be 16 times
 
 
 def pot(count=6000, seed=0):

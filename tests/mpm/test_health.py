@@ -189,15 +189,17 @@ def test_numbers_of_a_rollout_that_cannot_be_are_named():
 def test_a_summary_tells_the_worst_of_all_frames_and_energy_from_nowhere():
     gravity = np.asarray((0.0, 0.0, -9.81))
     healths = [health_of(unconverged=2, first_bad_frame=0), health_of(wall_hits=3, first_bad_frame=0), health_of()]
-    records = {0: health_record(cube(), None, gravity)}
-    records |= {k + 1: health_record(cube((0.0, 0.0, float(k))), own, gravity) for k, own in enumerate(healths)}
+    records = {0: health_record(cube(), None, gravity, TABLE)}
+    records |= {k + 1: health_record(cube((0.0, 0.0, float(k))), own, gravity, TABLE) for k, own in enumerate(healths)}
     told = summary(records)
     assert (told["unconverged"], told["wall_hits_at_most"], told["first_bad_frame"], told["frames"]) == (2, 3, 1, 3)
     mass = float(cube().mass.sum())
     np.testing.assert_allclose(told["kinetic_energy_J"], [0, 0, mass / 2, 2 * mass], rtol=1e-5)
     np.testing.assert_allclose(told["mass_kg"], 4 * [mass], rtol=1e-6)
     lost = replace(cube(), x=cube().x.at[0].set(np.nan))
-    assert health_record(lost, healths[0], gravity)["mass"] == pytest.approx(mass - float(cube().mass[0]), rel=1e-6)
+    assert health_record(lost, healths[0], gravity, TABLE)["mass"] == pytest.approx(
+        mass - float(cube().mass[0]), rel=1e-6
+    )
     said = " ".join(remarks(told, driven=False))
     assert "2 implicit steps did not converge" in said
     assert "3 particles met the wall" in said

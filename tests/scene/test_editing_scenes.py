@@ -150,7 +150,7 @@ def test_dx_has_a_default_and_the_plan_says_the_work(tmp_path):
     assert default_dx(draft, inputs.gaussians, plan.labels, inputs.ids) == pytest.approx(1.5 * plan.dx, rel=0.05)
     told = _modelled(scene, RunReport(sizes={"dx": plan.dx}))
     assert told["grid spacing"] == f"{plan.dx:g} m"
-    needs = counted(scene, inputs, plan, substeps=40, integrator="explicit", voted=False)
+    needs = counted(scene, inputs, plan, substeps=40, integrator="explicit")
     line = plan_line(needs, predict(needs))
     assert line.startswith(f"{len(plan.particles):,} particles (ball {len(plan.particles):,}) on a grid of dx = ")
     assert "3 frames of 40 substeps: about " in line

@@ -2,6 +2,10 @@
 
 import dataclasses
 import re
+import shlex
+import warnings
+from itertools import pairwise
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,8 +20,10 @@ from pigjax.core.errors import InputError
 from pigjax.scene import budget as budgets
 from pigjax.scene import load_scene, plan_scene, run_scene, scene_from
 from pigjax.scene.arrangement import arrange
-from pigjax.scene.budget import Budget, Choice, bound, choose, front_of
-from pigjax.scene.costs import Body, Pace, matter_error, predict, run_parts, shipped_prices
+from pigjax.scene.budget import Budget, Choice, bound, candidates, choose, front_of
+from pigjax.scene.costs import Body, matter_error, predict, run_parts, shipped_prices
+from pigjax.scene.decode import merged, settings_from
+from pigjax.scene.pace import Pace
 from pigjax.scene.plan import make_plan, read_inputs, segment
 from pigjax.scene.required import counted, required_by, shape_of, survey
 from pigjax.scene.run_error import Followed, estimated_error
@@ -69,6 +75,33 @@ def test_what_a_scene_does_not_require_costs_nothing():
     more = dataclasses.replace(NEEDS, contact=True, forces=2, error_frames=5)
     added = {part.name for part in run_parts(more)} - names
     assert {"contact of bodies", "forces", "estimated error: law neo_hookean"} <= added
+
+
+def test_own_splats_shadows_and_still_pictures_have_prices():
+    prices = shipped_prices()
+    plain = predict(NEEDS, prices)
+    own = predict(dataclasses.replace(NEEDS, own=4000, refitted=4000, refits=1), prices)
+    assert own.run["splats"] > plain.run["splats"] == 0
+    assert own.compile["splats"] > 0
+    assert own.run["draw"] > plain.run["draw"]
+    lit = predict(dataclasses.replace(NEEDS, light=8), prices)
+    assert lit.run["draw"] > predict(dataclasses.replace(NEEDS, light=1), prices).run["draw"] > plain.run["draw"]
+    still = predict(dataclasses.replace(NEEDS, redrawn=0.2), prices)
+    assert still.run["draw"] < plain.run["draw"]
+    twice = predict(dataclasses.replace(NEEDS, windows=2), prices)
+    assert twice.compile["simulate"] == pytest.approx(2 * plain.compile["simulate"])
+
+
+def test_a_scene_tells_its_own_splats_light_and_still_camera(scene):
+    far = merged(values(), {"camera": {"width": 480, "height": 400, "radius": 4.0}})
+    base = required_by(survey(scene_from(far, folder=scene.folder)))
+    assert 0.02 < base.redrawn < 0.3  # a ball of a tenth of the picture's width
+    assert (base.own, base.refits, base.light) == (0, 0, 0)
+    entry = {"ball": {"id": 1, "material": "sand", "splats": "auto", "refit": False}}
+    changes = {"objects": entry, "light": {"direction": [0, 0, -1]}, "camera": {"sweep": 90.0}}
+    more = required_by(survey(scene_from(merged(values(), changes), folder=scene.folder)))
+    assert (more.redrawn, more.light, more.refits) == (1.0, 8, 0)
+    assert more.own == 4 * more.particles
 
 
 def test_an_unknown_law_costs_what_the_dearest_does():
@@ -173,10 +206,48 @@ def test_bounds_that_are_none_are_refused(name, value):
         bound(name, value)
 
 
-def test_the_pace_is_told_at_each_quarter():
-    pace = Pace(predict(NEEDS, PRICES), 10, True)
-    assert [frame for frame in range(1, 11) if pace.line(frame)] == [3, 5, 8]
-    assert pace.line(5).startswith("frame 5 of 10: 1 s since the first, 2 s predicted")
+def test_a_run_is_told_beside_its_prediction_and_a_late_one_warns_once():
+    now, said = [0.0], []
+    planned = SimpleNamespace(prediction=predict(NEEDS, PRICES), budget=Budget(time=10.0), speed={})
+    pace = Pace(None, said.append, planned, clock=lambda: now[0])
+    for stage in ("segment", "seed"):
+        pace(stage, 0, 1)
+        pace(stage, 1, 1)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        for stage, of in (("simulate", 10), ("draw", 11)):
+            for frame in range(of + 1):
+                now[0] += 1.0
+                pace(stage, frame, of)
+    (late,) = warned
+    assert "about 11 s in all, more than the 10 s that it may take" in str(late.message)
+    lines = [line for line in said if not line.startswith("note: ")]
+    assert [line.partition(":")[0] for line in lines] == [
+        "segment", "seed", "simulate 3 of 10", "simulate 5 of 10", "simulate 8 of 10", "simulate",
+        "draw 3 of 11", "draw 6 of 11", "draw 9 of 11", "draw",
+    ]  # fmt: skip
+    assert lines[3] == "simulate 5 of 10: 6 s so far, 2 s predicted; about 6 s in all"
+    assert len(said) == len(lines) + 1
+
+
+def test_a_run_that_is_larger_than_its_budget_when_counted_warns_before_it():
+    said = []
+    planned = SimpleNamespace(prediction=predict(NEEDS, PRICES), budget=Budget(time=2.0), speed={})
+    with pytest.warns(UserWarning, match=r"counted from its particles the run takes \d+ s, .* budget of time = 2 s"):
+        Pace(None, said.append, planned).counted(NEEDS)
+    assert said[0].startswith("note: counted")
+    planned.budget = Budget(time=1e6)
+    Pace(None, said.append, planned).counted(NEEDS)
+    assert len(said) == 1
+
+
+def test_a_resumed_run_and_one_without_a_plan_tell_nothing():
+    said, planned = [], SimpleNamespace(prediction=predict(NEEDS, PRICES), budget=Budget(time=1e-9), speed={})
+    for of, first in ((planned, 4), (None, 0)):
+        pace = Pace(None, said.append, of)
+        for frame in range(first, 11):
+            pace("simulate", frame, 10)
+    assert not said
 
 
 # what a scene requires
@@ -208,7 +279,7 @@ def test_an_estimate_is_near_what_is_seeded(scene):
     of, inputs, labels = arrange(scene, inputs, segment(scene, inputs))
     plan = make_plan(of, inputs, labels)
     rule = stages_of(plan, 3)[0].rule
-    true = counted(of, inputs, plan, substeps=rule.first, integrator=rule.config.integrator, voted=False)
+    true = counted(of, inputs, plan, substeps=rule.first, integrator=rule.config.integrator)
     assert guess.guessed
     assert not true.guessed
     assert guess.particles == pytest.approx(true.particles, rel=0.15)
@@ -216,6 +287,10 @@ def test_an_estimate_is_near_what_is_seeded(scene):
     assert guess.nodes == pytest.approx(true.nodes, rel=0.4)
     assert guess.bodies[0].cells == pytest.approx(true.bodies[0].cells, rel=0.1)
     assert (guess.gaussians, guess.moving, guess.pixels, guess.states) == (1500, 1500, 48 * 40, 4)
+    for masks in (None, np.ones((1, 2, 2), int)):  # photos without masks cast no votes
+        inputs.views = SimpleNamespace(names=["a"], images=None, masks=masks)
+        there = counted(of, inputs, plan, substeps=1, integrator="explicit")
+        assert there.voted == (masks is not None)
 
 
 def test_a_finer_grid_takes_more_of_everything(scene):
@@ -224,7 +299,7 @@ def test_a_finer_grid_takes_more_of_everything(scene):
     fine = required_by(looked, budgets.changed(looked.scene, {"simulation": {"dx": 0.025}}))
     assert fine.particles > 1.5 * coarse.particles
     assert fine.substeps > coarse.substeps
-    assert fine.nodes > 4 * coarse.nodes
+    assert fine.nodes > 2 * coarse.nodes  # not eight times: some cells around matter are as many
     assert matter_error(fine) == pytest.approx(matter_error(coarse) / 2, rel=1e-6)
 
 
@@ -248,6 +323,28 @@ def test_a_plan_keeps_its_budget_and_changes_only_the_knobs(scene):
     assert quick.prediction.error < 0.5
     with pytest.raises(InputError, match=r"time = 0.001 s cannot be kept: the nearest is"):
         plan_scene(scene, time=0.001, probe=False)
+
+
+def test_the_settings_of_a_draft_are_those_that_its_file_takes(tmp_path):
+    io.save_ply(tmp_path / "cloud.ply", ball(1500))
+    draft = values(accuracy="draft")
+    fine = plan_scene(scene_from(draft, folder=tmp_path), error=0.06, probe=False)
+    assert any(setting.startswith("simulation.dx=") for setting in fine.settings)
+    again = scene_from(merged(draft, settings_from(fine.settings)), folder=tmp_path)
+    assert again.simulation.dx == pytest.approx(fine.scene.simulation.dx, rel=1e-8)
+    assert again.simulation.cfl == fine.scene.simulation.cfl
+    assert again.drawing == fine.scene.drawing
+
+
+def test_no_fluid_takes_the_step_at_which_it_breaks_down(scene):
+    def steps(law):
+        needs = dataclasses.replace(NEEDS, bodies=(Body("ball", law, 1000, 8.0),))
+        return {c["simulation"].get("cfl") for c in candidates(scene, needs, dict) if "simulation" in c}
+
+    assert steps("neo_hookean") == {None, 0.8}
+    assert steps("fluid") == {None}
+    water = dataclasses.replace(NEEDS, bodies=(Body("water", "fluid", 1000, 8.0),), cfl=0.6)
+    assert matter_error(dataclasses.replace(water, cfl=0.8), PRICES) == matter_error(water, PRICES)
 
 
 @pytest.mark.slow
@@ -310,15 +407,26 @@ def test_without_the_option_nothing_is_simulated_again(scene, tmp_path):
 def test_the_command_prints_prices_and_writes_the_scene(tmp_path, monkeypatch):
     monkeypatch.setattr(budgets, "speed_against", lambda measured: {"step": 1.0})
     write_throw(tmp_path)
-    said = CliRunner().invoke(
-        app, ["plan", str(tmp_path / "scene.toml"), "--error", "8%", "-o", str(tmp_path / "planned.toml")]
-    )
+    file, options = tmp_path / "scene.toml", ["--accuracy", "draft", "--set", "simulation.frames=4", "--drop-invalid"]
+    said = CliRunner().invoke(app, ["plan", str(file), *options, "--error", "8%", "-o", str(tmp_path / "planned.toml")])
     assert said.exit_code == 0, said.output
     assert re.search(r"about [\d,]+ particles \(ball", said.output)
     assert "left out:" in said.output
     assert "law neo_hookean" in said.output or "the rest" in said.output
-    assert "--set simulation.dx=" in said.output
     planned = load_scene(tmp_path / "planned.toml")
+    command = next(line for line in said.output.splitlines() if line.startswith("pigjax run"))
+    words = shlex.split(command)
+    assert words[2] == str(file)
+    assert "--drop-invalid" in words
+    again = load_scene(
+        file,
+        accuracy=words[words.index("--accuracy") + 1],
+        changes=settings_from([word for before, word in pairwise(words) if before == "--set"]),
+    )
+    assert again.simulation.dx == pytest.approx(planned.simulation.dx, rel=1e-8)
+    assert again.simulation.frames == 4
+    assert again.simulation.cfl == planned.simulation.cfl
+    assert again.drawing == planned.drawing
     assert planned.simulation.dx < 0.08
     assert jnp.isfinite(planned.simulation.dx)
     again = CliRunner().invoke(

@@ -48,7 +48,7 @@ def thrown(tmp_path_factory):
 
 
 def test_the_page_tells_of_the_run_and_fetches_nothing(thrown):
-    _, out = thrown
+    report, out = thrown
     page = Balanced((out / "report.html").read_text())
     text = " ".join(page.texts)
     for word in (
@@ -60,8 +60,21 @@ def test_the_page_tells_of_the_run_and_fetches_nothing(thrown):
         "Stretch of the splats",
         "jaxlib",
         "dx = 0.08",
+        "by colliders, pins, forces",
+        "kg m/s",
+        "torn matter under pressure",
     ):
         assert word in text
+    drift = report.health["drift"]
+    assert drift["mass_kg"] == 0
+    assert not drift["alone"]
+    assert len(report.health["elastic_energy_J"]) == 4
+    assert max(report.health["elastic_energy_J"][1:]) > 0 == pytest.approx(report.health["elastic_energy_J"][0])
+    sums = [
+        np.add.reduce([report.health[f"{name}_energy_J"][k] for name in ("kinetic", "gravity", "elastic")])
+        for k in (0, 3)
+    ]
+    assert drift["energy_J"] == pytest.approx(sums[1] - sums[0])
     assert page.addresses[0] == "video.mp4"
     assert all(address == "video.mp4" or address.startswith("data:image/jpeg;base64,") for address in page.addresses)
     picture = Image.open(BytesIO(base64.b64decode(page.addresses[1].partition(",")[2])))
@@ -107,7 +120,6 @@ def test_names_and_messages_of_files_are_text():
 def test_what_is_left_out_follows_the_scene():
     report = RunReport(modelled={"sh_coefficients": 4}, sizes={"gaussians_without_particle": 7})
     alone = " ".join(left_out(scene_from(values(planes={}, simulation__fill=False)), report))
-    assert "curves below" not in alone, "pigjax plan prints this list, and no curves"
     for told in ("hollow", "Any support", "turn with the matter", "7 Gaussians"):
         assert told in alone
     assert "Contact" not in alone

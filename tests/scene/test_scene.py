@@ -212,7 +212,9 @@ def test_objects_that_a_scene_does_not_name_are_warned_of(monkeypatch):
     scene = load_scene(EXAMPLE)
     few = msgspec.structs.replace(scene, objects={name: scene.objects[name] for name in ("table", "duck")})
     seen = jnp.asarray([0, 1, 2, 7, 4, 4, -1])
-    monkeypatch.setattr(plan, "lift", lambda *args, **kwargs: Labels(seen, np.zeros((len(seen), 8)), np.ones(len(seen))))
+    monkeypatch.setattr(
+        plan, "lift", lambda *args, **kwargs: Labels(seen, np.zeros((len(seen), 8)), np.ones(len(seen)))
+    )
     inputs = plan.read_inputs(few)
     with pytest.warns(UserWarning, match="says nothing of jenga, mug: drawn, but nothing collides"):
         plan.segment(few, inputs)

@@ -13,8 +13,8 @@ from pigjax.mpm.materials.tensors import Scalars
 
 Stretches = Float[Array, "3 *n"]
 
-_LARGEST_HARDENING = 10.0  # packed snow is this many times as stiff at most; steps stay stable up to there
-_LOOSEST = math.log(
+LARGEST_HARDENING = 10.0  # packed snow is this many times as stiff at most; steps stay stable up to there
+LOOSEST = math.log(
     20.0
 )  # bound of log Jp in the hardening factor: beyond, snow is powder without stress, and exp must not overflow
 
@@ -30,13 +30,13 @@ def crumble(stretches: Stretches, hardening: Scalars, m: Parameters) -> tuple[St
 
 def hardening_factor(hardening: Scalars, m: Parameters) -> Scalars:
     """exp(ξ (1 − Jp)), by which μ and λ grow, at most 10."""
-    exponent = m.hardening_coefficient * (1 - jnp.exp(jnp.minimum(hardening, _LOOSEST)))
-    return jnp.exp(jnp.minimum(exponent, math.log(_LARGEST_HARDENING)))
+    exponent = m.hardening_coefficient * (1 - jnp.exp(jnp.minimum(hardening, LOOSEST)))
+    return jnp.exp(jnp.minimum(exponent, math.log(LARGEST_HARDENING)))
 
 
 def largest_hardening_factor(m: Parameters) -> Scalars:
     """Limit of `hardening_factor` as snow is packed."""
-    return jnp.exp(jnp.minimum(m.hardening_coefficient, math.log(_LARGEST_HARDENING)))
+    return jnp.exp(jnp.minimum(m.hardening_coefficient, math.log(LARGEST_HARDENING)))
 
 
 def stress(stretches: Stretches, hardening: Scalars, m: Parameters) -> Stretches:
