@@ -38,6 +38,7 @@ app = typer.Typer(
 console = Console(stderr=True, markup=False, emoji=False, highlight=False)
 answers = Console(markup=False, emoji=False, highlight=False)  # what a command was asked for, for a pipe or a file
 _MOST_DEVICES = 8  # an image has too few rows of tiles for more
+_MOST_STEPS = 100  # between two lines
 _MOST_LINES = 500  # of one stage where there is no terminal
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace results of other settings or files instead of refusing them.")
@@ -159,7 +160,7 @@ class _Stage:
 class Lines:
     """Progress as lines, for a log file: one for each step done, with the time left; used as rich's `Progress` is.
 
-    A stage of more than 500 steps prints a line for each hundredth of them.
+    A stage of more than 500 steps prints a line for each hundredth of them, and at least for each 100 steps.
     """
 
     def __init__(self, columns: tuple[str, ...]) -> None:
@@ -184,7 +185,7 @@ class Lines:
             stage.first, stage.begun = completed if completed < (stage.total or 0) else 0, time.monotonic()
         before, stage.completed = stage.completed or 0, completed
         total = stage.total or 0
-        every = 1 if total <= _MOST_LINES else total / 100
+        every = 1 if total <= _MOST_LINES else min(total / 100, _MOST_STEPS)
         if completed > 0 and (completed // every > before // every or completed == stage.total):
             console.print(said(self._line(stage, completed)), soft_wrap=True)
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Int
 
 from pigjax.core.arguments import checked
 from pigjax.core.camera import Camera
-from pigjax.core.errors import InputError
+from pigjax.core.errors import InputError, MissingFileError
 from pigjax.core.views import Views
 from pigjax.io.cameras import load_cameras, load_view_masks, load_views, read_capture
 from pigjax.io.capture import without_suffix
@@ -65,7 +65,7 @@ def load_dataset(
     - "3d-ovs" (Liu et al. 2023): `segmentations/classes.txt` and `segmentations/<number>/<class>.png`, where the number
       counts the files in `images` in the order of names. A mask is where a pixel is 255.
     - "views": any posed photos; truth is `object_mask` of the test split, with the names of `names.json`
-      {id: name}.
+      {id: name}; where no view of that split has a mask, of every third view that has one.
 
     Pictures of zeros and ones are masks as well. Views with truth never vote. As in Gaussian Grouping's data, where
     `object_mask` of the test views is black, a view that is black all over or has no mask does not vote, nor is a black
@@ -213,15 +213,23 @@ def _3d_ovs(root: Path, views: Sequence[str], images: PathLike | None, origin: O
 
 def _labelled_views(root: Path, views: Sequence[str], images: PathLike | None, origin: Origin | None) -> _Truths:
     names = load_names(root / "names.json")
-    test = load_views(root, images=images, masks=root / "object_mask", split="test", origin=origin)
-    assert test.masks is not None
+    folder = root / "object_mask"
+    try:
+        test = load_views(
+            root, images=images, masks=folder, missing_masks="abstain", split="test", origin=origin
+        ).masked
+        tested, ids = list(test.names), np.asarray(test.masks)
+    except MissingFileError:  # no held-out view has a mask: some of the others, which do not vote then
+        every, _ = load_view_masks(root, folder, list(views), images=images, missing="abstain")
+        chosen = np.flatnonzero(every[:, 0, 0] >= 0)[1::3]
+        tested, ids = [views[i] for i in chosen], every[chosen]
     masks = {
-        (view, name): np.asarray(mask) == number
+        (view, name): mask == number
         for number, name in names.items()
-        for view, mask in zip(test.names, test.masks)
+        for view, mask in zip(tested, ids)
         if number > 0 and np.any(mask == number)  # an object that a view does not show is no black truth
     }
-    return _Truths(list(test.names), masks, names)
+    return _Truths(tested, masks, names)
 
 
 LAYOUTS: dict[str, Callable[[Path, Sequence[str], PathLike | None, Origin | None], _Truths]] = {

@@ -32,8 +32,10 @@ _BACKGROUND = 0.1  # share of the sparse points
 class FitConfig(eqx.Module):
     """Settings of a reconstruction, all static.
 
-    Learning rates are those of Adam, per step, of the order of those of 3DGS (Kerbl et al. 2023). Relocation, noise and
-    regularizers follow 3DGS-MCMC (Kheradmand et al. 2024).
+    Learning rates are those of Adam, per step, of the order of those of 3DGS (Kerbl et al. 2023); those of scales,
+    quaternions and colours are twice as large. Relocation, noise and regularizers have the form of those of 3DGS-MCMC
+    (Kheradmand et al. 2024) with smaller weights: its opacity and scale regularizers are 0.01, and its noise is larger.
+    Moved Gaussians and those that they moved onto lose their moments.
 
     Raises:
         InputError: a number is not finite or out of range, or `splats` is not reached within the steps.
@@ -81,7 +83,7 @@ class FitConfig(eqx.Module):
     error_views: int = static_field(default=0, limits=Limits(0, LARGEST_WHOLE))
     # on the centres, times their rate, per squared extent; 0 traces none
     noise: float = static_field(default=200.0, limits=Limits(0, 1e9))
-    # weight of the mean opacity in the loss, as in 3DGS-MCMC; 0 traces none
+    # weight of the mean opacity in the loss, a fifth of that of 3DGS-MCMC; 0 traces none
     opacity_regularizer: float = static_field(default=0.002, limits=Limits(0, 1e6))
     scale_regularizer: float = static_field(default=0.002, limits=Limits(0, 1e6))  # per extent of the points
     # steps between held-out scores, where there are held-out views

@@ -109,6 +109,10 @@ def test_a_stage_of_many_steps_prints_a_line_for_each_hundredth(capsys):
     told = lines_of(capsys)
     assert len(told) == 100
     assert told[-1].startswith("reconstruct 3000/3000, ")
+    task = lines.add_task("reconstruct", total=12_000)
+    for step in range(0, 12_001, 50):
+        lines.update(task, completed=step)
+    assert len(lines_of(capsys)) == 120  # a line for each 100 steps
 
 
 def test_quiet_prints_errors_alone(tmp_path):

@@ -202,6 +202,23 @@ def test_a_georeferenced_data_set_is_scored_once_its_origin_is_given(tmp_path):
     assert scores["levels"]["visible"]["mean_iou"] == pytest.approx(1.0)
 
 
+def test_views_without_masks_have_no_truth_and_do_not_vote(tmp_path):
+    """A capture with few masks: truth is of the held-out views with one, else of every third view with one."""
+    write_folder(tmp_path, "views")
+    (tmp_path / f"object_mask/{TEST[0]}.png").unlink()
+    assert {view for view, _ in load_dataset(tmp_path, "views").truths} == set(TEST[1:])
+    for view in TEST[1:]:
+        (tmp_path / f"object_mask/{view}.png").unlink()
+    masked = [view for view in VIEWS if view not in TEST]
+    read = load_dataset(tmp_path, "views")
+    assert {view for view, _ in read.truths} == set(masked[1::3])
+    assert len(read.cameras) == len(masked) - len(masked[1::3])
+    for view in masked:
+        (tmp_path / f"object_mask/{view}.png").unlink()
+    with pytest.raises(MissingFileError, match="object_mask"):
+        load_dataset(tmp_path, "views")
+
+
 def test_prompts_masks_labels_and_reference_may_be_given(tmp_path):
     write_folder(tmp_path, "lerf-mask")
     (tmp_path / "prompts.json").write_text('{"near": 1, "far": 2}')
