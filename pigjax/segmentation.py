@@ -136,7 +136,14 @@ def lift_masks(
         masks = jnp.where(jnp.asarray(valid), masks.astype(jnp.int32), _NO_ID)
     scanned = enough_capacity(gaussians, cameras, config) if settled or temperature is not None else config
     drawn = config if temperature is None else scanned
+    wait = None
+    if settled and is_known((splats, cameras, masks, thresholds)):  # compiled side by side: each takes seconds
+        none = jnp.zeros((len(splats), num_ids), np.min_scalar_type(len(cameras)))
+        break_ties = jax.tree_util.Partial(_credit_candidates, splats, cameras, masks, scanned)
+        wait = _elect.prepare(none, background, min_votes, purity, break_ties)
     votes, overflow = _collect(splats, cameras, masks, thresholds, num_ids, weighting, drawn, valid is not None)
+    if wait is not None:
+        wait()
     if settled and scanned is config:
         overflow += _left_out(splats, cameras, scanned)
     break_ties = jax.tree_util.Partial(_credit_candidates, splats, cameras, masks, scanned)

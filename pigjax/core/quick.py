@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import equinox as eqx
@@ -36,7 +38,7 @@ def quickly(function: Callable | None = None, *, once: bool = False) -> Any:
     """
     if function is None:
         return functools.partial(quickly, once=once)
-    traced = eqx.filter_jit(function)
+    traced, begun = eqx.filter_jit(function), set()
 
     @functools.cache
     def outermost(backend: str) -> Callable:
@@ -49,7 +51,28 @@ def quickly(function: Callable | None = None, *, once: bool = False) -> Any:
             return traced(*args)
         return outermost(jax.default_backend())(*args)
 
+    def prepare(*args: Any) -> Callable[[], None]:
+        """Begin to compile for such arguments in a thread, by a call without use; returns what waits for its end.
+
+        Nothing is done again for arguments of the same kind.
+        """
+        leaves, structure = jax.tree.flatten(args)
+        kinds = [(np.shape(leaf), getattr(leaf, "dtype", type(leaf))) for leaf in leaves]
+        key = str((structure, kinds, jax.default_backend(), jax.config.jax_enable_x64))  # type: ignore[attr-defined]
+        if not is_known(args) or is_compiling() or key in begun:
+            return lambda: None
+        begun.add(key)
+        thread = threading.Thread(target=_tried, args=(call, args))
+        thread.start()
+        return thread.join
+
+    call.prepare = prepare  # type: ignore[attr-defined]
     return call
+
+
+def _tried(function: Callable, args: tuple[Any, ...]) -> None:
+    with suppress(Exception):  # the call itself will tell
+        function(*args)
 
 
 @functools.cache

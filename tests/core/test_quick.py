@@ -40,3 +40,25 @@ def test_options_that_this_xla_does_not_know_are_left_out(monkeypatch, asked_ane
 def test_other_devices_take_none(monkeypatch, asked_anew):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert quick_options() == {}
+
+
+def test_what_was_prepared_is_compiled_once_and_faults_of_the_preparation_are_told_by_the_call():
+    traced = []
+
+    @quickly
+    def function(x, power: int):
+        if power == 0:
+            raise ValueError("no power")
+        traced.append(power)
+        return jnp.log(x) ** power
+
+    x = jnp.ones(3)
+    for _ in range(2):
+        function.prepare(x, 2)()
+    np.testing.assert_array_equal(function(x + 1, 2), np.log(np.full(3, 2, np.float32)) ** 2)
+    assert traced == [2]
+    jax.jit(lambda x: function.prepare(x, 3)())(x)
+    assert traced == [2], "inside of a program nothing is prepared"
+    function.prepare(x, 0)()
+    with pytest.raises(ValueError, match="no power"):
+        function(x, 0)
