@@ -24,6 +24,8 @@ from pigjax.scene.decode import merged
 from pigjax.scene.probe import probe
 
 PRICES = ROOT / "pigjax" / "scene" / "costs.json"
+_FRONTS = ("fixed_corotated", "neo_hookean", "stvk_hencky", "fibres", "drucker_prager")  # of `tradeoff`, by dx
+_LEAST = 1 / 3  # of a known price
 _TRUST = 0.1  # weight of the prices so far against that of one measurement
 _COLD = {SWITCH: "off", "JAX_ENABLE_COMPILATION_CACHE": "false"}
 
@@ -173,6 +175,9 @@ def fitted_prices(before: dict[str, Any], runs: list[Measured]) -> dict[str, Any
 def fitted_errors(before: costs.Prices, runs: list[Measured]) -> dict[str, float]:
     """Errors of the laws of runs that measured their own, of one law each: the median where there are several.
 
+    Laws whose error is a front of `tradeoff` keep that: a run of few frames hardly moves, so that its own estimate says
+    less. For the same reason no other error changes by more than a factor 3.
+
     Args:
         before: prices so far.
         runs: measured.
@@ -180,13 +185,17 @@ def fitted_errors(before: costs.Prices, runs: list[Measured]) -> dict[str, float
     found: dict[str, list[float]] = {}
     for run in runs:
         law, *others = run.needs.particles_of_law
-        if run.error is not None and not others and (guess := costs.matter_error(run.needs, before)):
-            found.setdefault(law, []).append(before.error[law] * run.error / guess)
+        if law in _FRONTS or run.error is None or others:
+            continue
+        if guess := costs.matter_error(run.needs, before):
+            found.setdefault(law, []).append(before.error[law] * float(np.clip(run.error / guess, 1 / 3, 3)))
     return {law: float(f"{np.median(values):.2g}") for law, values in found.items()}
 
 
 def least_squares(known: dict[str, float], amounts: list[dict[str, float]], values: list[float]) -> dict[str, float]:
-    """Prices x >= 0 with amounts · x near the values, relatively, and x near the known ones, relatively.
+    """Prices x with amounts · x near the values, relatively, and x near the known ones, relatively.
+
+    None falls below a third of what was known: where two amounts go together, the fit would give one of them no price.
 
     Args:
         known: prices so far, by name.
@@ -201,8 +210,8 @@ def least_squares(known: dict[str, float], amounts: list[dict[str, float]], valu
     ]  # fmt: skip
     matrix = np.array([*(r for r, _ in rows), *(_TRUST * np.eye(len(names)))])
     target = np.array([*(v for _, v in rows), *([_TRUST] * len(names))])
-    found, _ = nnls(matrix, target)
-    return {name: float(f"{value:.3g}") for name, value in zip(names, found * scale)}
+    above, _ = nnls(matrix, target - _LEAST * matrix.sum(1))
+    return {name: float(f"{value:.3g}") for name, value in zip(names, (_LEAST + above) * scale)}
 
 
 def check(options) -> None:

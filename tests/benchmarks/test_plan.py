@@ -57,10 +57,27 @@ def test_scenes_of_the_check_are_of_many_kinds():
 
 def test_errors_are_fitted_by_runs_of_one_law_that_measured_theirs():
     before = costs.shipped_prices()
-    jelly = dataclasses.replace(NEEDS, bodies=NEEDS.bodies[:1])
-    guess = costs.matter_error(jelly, before)
-    runs = [Measured(jelly, {}, {}, 1e9, {}, 2 * guess, None), Measured(NEEDS, {}, {}, 1e9, {}, 5.0, None)]
-    assert fitted_errors(before, runs) == {"neo_hookean": pytest.approx(2 * before.error["neo_hookean"], rel=0.05)}
+    body = NEEDS.bodies[0]
+    snow, jelly = (dataclasses.replace(NEEDS, bodies=(body._replace(law=law),)) for law in ("snow", "neo_hookean"))
+    guess = costs.matter_error(snow, before)
+
+    def fitted(error):
+        return fitted_errors(before, [Measured(snow, {}, {}, 1e9, {}, error, None)])["snow"] / before.error["snow"]
+
+    assert fitted(2 * guess) == pytest.approx(2, rel=0.05)
+    assert fitted(1e-3 * guess) == pytest.approx(1 / 3, rel=0.05), "few frames hardly move"
+    assert fitted(100 * guess) == pytest.approx(3, rel=0.05)
+    mixed = dataclasses.replace(NEEDS, bodies=(*snow.bodies, *jelly.bodies))
+    others = [Measured(needs, {}, {}, 1e9, {}, 5.0, None) for needs in (jelly, mixed)]
+    assert fitted_errors(before, others) == {}, "a front of another study, and several laws"
+
+
+def test_no_price_vanishes_where_two_amounts_go_together():
+    known = {"law fluid": 3e-7, "nodes": 1e-8}
+    amounts = [{"law fluid": 1e6 * k, "nodes": 1e8 * k} for k in (1, 2, 3)]
+    fitted = least_squares(known, amounts, [0.5 * k for k in (1, 2, 3)])  # less than both together cost before
+    assert fitted["law fluid"] >= 0.99e-7
+    assert fitted["nodes"] >= 0.33e-8
 
 
 def test_costs_count_the_processes_that_a_benchmark_started():
