@@ -101,7 +101,9 @@ def _without_cache(no_cache: bool) -> bool:
 
 NoCache = Annotated[
     bool,
-    typer.Option("--no-cache", help="Recompile all programs and vote anew; store nothing.", callback=_without_cache),
+    typer.Option(
+        "--no-cache", help="Compile all programs and make all results again; store none.", callback=_without_cache
+    ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors alone.", callback=_hush)]
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import equinox as eqx
-from jaxtyping import Array, Float
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.arrays import real_field
 from pigjax.core.checks import check_axes
@@ -25,6 +28,11 @@ class Gaussians(eqx.Module):
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+
+def some_gaussians(gaussians: Gaussians, rows: Int[np.ndarray, "m"] | Bool[np.ndarray, "n"]) -> Gaussians:
+    """Some of the Gaussians. On the host: JAX would compile a program for each number of them."""
+    return jax.tree.map(lambda values: jnp.asarray(np.asarray(values)[rows]), gaussians)
 
 
 class Splats(eqx.Module):

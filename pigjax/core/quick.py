@@ -14,9 +14,9 @@ import numpy as np
 
 from pigjax.core.arrays import is_compiling, is_known
 
-# What draws is compiled in two thirds of the processor time and runs as fast; steps of matter would run half as fast.
+# What draws is compiled sooner and runs as fast; steps of matter would run slower, and are not compiled so.
 _DRAWING: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
-# In a sixth of the time, and four times slower to run: for what runs once.
+# Compiled soonest and slow to run: for what runs once.
 _ONCE: dict[str, Any] = {**_DRAWING, "xla_backend_optimization_level": 0}
 
 

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from pigjax.core.arguments import checked
 from pigjax.core.arrays import Vector
 from pigjax.core.errors import InputError
-from pigjax.core.gaussians import SH_CONSTANT
+from pigjax.core.gaussians import SH_CONSTANT, some_gaussians
 from pigjax.coupling.sdf_collider import tangent_planes
 from pigjax.coupling.solid import Shell, disc_samples, share_seen, shell_of, surface_of
 from pigjax.segmentation import Labels
@@ -107,7 +107,7 @@ def fill_hidden(
         raise InputError(f"object_id = {object_id}: no Gaussian has it; labels hold {np.unique(ids)}.")
     hiding = ids[ids > 0] if hidden_by is None else np.asarray(list(hidden_by), int)
     others = {int(k): _samples(gaussians, ids == k, name) for k in np.setdiff1d(hiding, [object_id]) if k in ids}
-    shell = shell_of(_rows(gaussians, own), name=name)
+    shell = shell_of(some_gaussians(gaussians, own), name=name)
     above = np.asarray(up, float) / np.linalg.norm(up)
     patch = _patch(shell, others, above, eyes, name)
     if patch is None:
@@ -172,13 +172,9 @@ class _Near(NamedTuple):
         return np.einsum("nk,nk...->n...", self.weights, values[self.nodes])
 
 
-def _rows(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
-    return jax.tree.map(lambda column: np.asarray(column)[rows], gaussians)
-
-
 def _samples(gaussians: Gaussians, members: Bool[np.ndarray, "n"], name: str) -> Float[np.ndarray, "b 3"]:
     """Points all over the surface of an object [m], without its floaters."""
-    shell = shell_of(_rows(gaussians, members), name=name)
+    shell = shell_of(some_gaussians(gaussians, members), name=name)
     return disc_samples(shell, shell.connected, shell.spacing)
 
 

@@ -19,7 +19,7 @@ from pigjax.io.archives import load_arrays, save_arrays
 from pigjax.io.compile_cache import cache_root, trim
 from pigjax.io.provenance import digest
 
-LIMIT = 1 << 28  # bytes; the demo leaves 6 MB
+LIMIT = 1 << 28  # bytes; the demo leaves some 4 MB
 _LIBRARIES = ("jax", "jaxlib", "numpy", "scipy")  # whose versions may change a result
 _folder: Path | None = None
 

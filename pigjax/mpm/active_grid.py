@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from pigjax.core.arguments import checked
 from pigjax.core.arrays import Vector, is_known
@@ -33,6 +33,11 @@ _ROOM_AT_TRACE = 1.5  # the same where only the start is known
 _UNIT = 4  # nodes, of which sides are multiples
 _AROUND = 6  # nodes a side of a window of fixed size beyond the extent of matter: the kernel's, and some room
 _PER_DEVICE = 4096  # particles that are worth a device of their own
+
+
+def with_room(needed: Int[np.ndarray, "3"]) -> Int[np.ndarray, "3"]:
+    """Sides of the window that is taken where so many nodes are needed."""
+    return -(-(needed * _ROOM).astype(int) // _UNIT) * _UNIT
 
 
 @dataclass
@@ -93,7 +98,7 @@ class ActiveGrid:
         shape = np.array(self.shape)
         wasteful = _nodes(shape) > max(8 * _nodes(needed), 8 * count)
         if (needed > shape).any() or wasteful:
-            room = -(-(needed * _ROOM).astype(int) // _UNIT) * _UNIT
+            room = with_room(needed)
             shape = room if wasteful else np.maximum(room, shape)
         shape = np.minimum(shape, sides)
         if (nodes := _nodes(shape)) > LARGEST:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from pigjax import io
-from pigjax.core.gaussians import SH_CONSTANT
+from pigjax.core.gaussians import SH_CONSTANT, some_gaussians
 from pigjax.coupling.binding import bind
 from pigjax.coupling.liquid import Kernels, LiquidRest, liquid_kernels, liquid_rest, sheen, smoothed, with_kernels
 from pigjax.coupling.own_splats import OwnSplats, make_own_splats
@@ -152,7 +152,7 @@ def with_own(
             parts.append((_fainter(poured, entry.transparency), carriers))
             continue
         members = np.flatnonzero(object_id == inputs.ids[name])
-        mine = _rows(inputs.gaussians, members)
+        mine = some_gaussians(inputs.gaussians, members)
         settings: dict[str, Any] = {} if entry.refit else {"steps": 0}
         axis = axis_of(scene.input.up)  # about which the fit's cameras stand
         mark = io.digest(mine, x[rows], plan.dx, entry.inside, axis, settings, make_own_splats)
@@ -178,7 +178,7 @@ def with_own(
     place[kept] = np.arange(len(kept))
     everything = jax.tree.map(
         lambda *columns: jnp.asarray(np.concatenate([np.asarray(column) for column in columns])),
-        _rows(inputs.gaussians, kept), *(part for part, _ in parts),
+        some_gaussians(inputs.gaussians, kept), *(part for part, _ in parts),
     )  # fmt: skip
     own = {f: jnp.asarray(np.asarray(getattr(plan.labels, f))[kept]) for f in ("object_id", "votes", "confidence")}
     labels = replace(plan.labels, **own)
@@ -200,11 +200,6 @@ def with_own(
     return inputs, replace(plan, particles=particles, labels=labels, binding=binding), arrays
 
 
-def _rows(gaussians: Gaussians, rows: Int[np.ndarray, "m"]) -> Gaussians:
-    """Some of the Gaussians. On the host: JAX would compile a program for each of so many sizes."""
-    return jax.tree.map(lambda values: jnp.asarray(np.asarray(values)[rows]), gaussians)
-
-
 def is_grainy(entry: ObjectSpec, law: str) -> bool:
     """Whether a volume is drawn as grains: its brightness varies, and it is no fluid."""
     return isinstance(entry, VolumeSpec) and entry.grain > 0 and law != "fluid"
@@ -218,7 +213,7 @@ def _of_volume(
     They are those that its particles have, on a smooth surface where it is a fluid, and several where it has grains.
     """
     carried = np.asarray(plan.particles.gaussian)[rows]
-    mine = _rows(gaussians, carried)
+    mine = some_gaussians(gaussians, carried)
     if is_grainy(entry, law):
         return _grains(mine, entry), np.repeat(rows, GRAINS)
     if entry.surface == "smooth" and law == "fluid":

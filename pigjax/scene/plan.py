@@ -20,6 +20,7 @@ from pigjax.clamp import ClampParams
 from pigjax.core.camera import Camera, orbit, stack_cameras
 from pigjax.core.checks import joined, suggest
 from pigjax.core.errors import SceneError
+from pigjax.core.gaussians import some_gaussians
 from pigjax.core.placing import placed
 from pigjax.core.regions import Region
 from pigjax.coupling.binding import Binding, bind
@@ -397,7 +398,7 @@ def still_solids(scene: Scene, inputs: Inputs, labels: Labels, dx: float) -> dic
         if not entry.fixed:
             continue
         members = np.flatnonzero(object_id == inputs.ids[name])
-        own = jax.tree.map(lambda values, members=members: jnp.asarray(np.asarray(values)[members]), inputs.gaussians)
+        own = some_gaussians(inputs.gaussians, members)
         where, spacing, up = joined("objects", name), dx / 2, axis_of(scene.input.up)
         if entry.hollow:
             make: Callable[..., SampledDistance] = vessel_from_gaussians

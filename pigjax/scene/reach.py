@@ -14,12 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from pigjax.mpm.active_grid import ActiveGrid, with_room
+
 LOOSE = ("fluid", "foam", "snow", "drucker_prager")  # laws whose matter parts, and spreads under its weight
-_SLACK, _ROOM, _UNIT = (
-    3,
-    1.4,
-    4,
-)  # of the active grid, see `ActiveGrid`: cells around matter, factor on its sides, nodes
 _LEAST_FRICTION = 0.05
 _MOST_FRAMES = 100  # looked at, evenly spread
 
@@ -100,10 +97,10 @@ def windows(extent: Extent, dx: float) -> Windows:
         extent: of `extent_of`.
         dx: grid spacing [m].
     """
-    shape, sizes = np.zeros(3, int), []
-    for needed in np.ceil((extent.high - extent.low) / dx).astype(int) + 2 * _SLACK + 1:
+    shape, sizes, around = np.zeros(3, int), [], math.ceil(ActiveGrid.slack) + 1
+    for needed in np.ceil((extent.high - extent.low) / dx).astype(int) + 2 * around + 1:
         if (needed > shape).any():
-            shape = np.maximum(-(-(needed * _ROOM).astype(int) // _UNIT) * _UNIT, shape)
+            shape = np.maximum(with_room(needed), shape)
         sizes.append(math.prod(shape.tolist()))
     return Windows(len(set(sizes)), float(np.mean(sizes)), max(sizes))
 

@@ -42,8 +42,9 @@ def test_other_devices_take_none(monkeypatch, asked_anew):
     assert quick_options() == {}
 
 
-def test_what_was_prepared_is_compiled_once_and_faults_of_the_preparation_are_told_by_the_call():
-    traced = []
+def test_what_was_prepared_is_compiled_once_and_faults_of_the_preparation_are_told_by_the_call(monkeypatch):
+    traced, begun, thread = [], [], quick.threading.Thread
+    monkeypatch.setattr(quick.threading, "Thread", lambda **given: begun.append(given) or thread(**given))
 
     @quickly
     def function(x, power: int):
@@ -57,6 +58,7 @@ def test_what_was_prepared_is_compiled_once_and_faults_of_the_preparation_are_to
         function.prepare(x, 2)()
     np.testing.assert_array_equal(function(x + 1, 2), np.log(np.full(3, 2, np.float32)) ** 2)
     assert traced == [2]
+    assert len(begun) == 1
     jax.jit(lambda x: function.prepare(x, 3)())(x)
     assert traced == [2], "inside of a program nothing is prepared"
     function.prepare(x, 0)()
